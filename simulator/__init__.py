@@ -1,0 +1,1 @@
+"""Synthetic tomography experiments with a known truth: analytic specimen, motion, X-rays, detector."""

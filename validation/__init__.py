@@ -1,0 +1,1 @@
+"""Scores of a measurement against its truth, figures, reports and the command line."""
