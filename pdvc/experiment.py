@@ -73,7 +73,7 @@ class GeometryEntry(Settings):
 
 
 class AcquisitionEntry(Settings):
-    """How the counts were made. The noise entries may be left out: then the noise is estimated from the data."""
+    """How the counts were made. The noise entries may be left out: then the noise is not known."""
 
     frames: Annotated[int, Field(ge=1)] = 1
     """frames averaged into each stored image"""
@@ -257,6 +257,13 @@ class StackWriter:
         if self.done == self._shape[0]:
             self._partial.replace(self.path)
             self._count.unlink()
+
+
+def _open_map(path: Path, shape: tuple[int, int, int]) -> np.memmap[Any, np.dtype[np.uint16]]:
+    pages = tifffile.memmap(path, mode="r+")
+    assert isinstance(pages, np.memmap)
+    # tifffile drops an axis of length one
+    return np.memmap(path, dtype=pages.dtype, mode="r+", offset=pages.offset, shape=shape)
 
 
 def _too_large(shape: Sequence[int]) -> bool:
