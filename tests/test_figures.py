@@ -1,0 +1,102 @@
+"""Figures draw what they are given: checked on the artists, and that every file is written."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests import synthetic_records as records
+from validation import figures
+from validation.axis import axis_history
+from validation.scores import point_errors
+
+
+@pytest.fixture(scope="module")
+def case():
+    truth, amplitude = records.stretched(*records.tensile_history())
+    return records.measurement(amplitude, unobserved=(8,)), truth
+
+
+def test_residuals_of_a_row_share_one_symmetric_scale(case):
+    measurement, _ = case
+    fields = measurement.residual_initial[[3, 12, 20]]
+    _, axes = figures.new_figure(8, 4, 3)
+    limit = figures.scale_limit(list(fields))
+    figures.draw_residuals(fields, ["a", "b", "c"], axes, limit=limit)
+    assert {ax.images[0].get_clim() for ax in axes} == {(-limit, limit)}
+    assert np.quantile(np.abs(fields), 0.998) <= limit
+
+
+@pytest.mark.parametrize("value", [1e-6, 0.0123, 0.1, 0.999, 7.3, 4e5])
+def test_scale_limits_are_round_and_just_large_enough(value):
+    limit = figures.scale_limit([np.array([value, -value])])
+    assert value * 0.999 <= limit <= 1.6 * value
+    assert f"{limit:.1e}".endswith(("0e", "5e")) or limit == pytest.approx(float(f"{limit:.1e}"))
+
+
+def test_scale_of_an_empty_residual_is_one():
+    assert figures.scale_limit([np.zeros((4, 5))]) == 1.0
+
+
+def test_translations_are_those_of_the_record(case):
+    measurement, truth = case
+    _, (ax,) = figures.new_figure(7, 3)
+    axis = axis_history(measurement, truth)
+    figures.draw_translations(axis, ax)
+    drawn = [line.get_ydata() for line in ax.lines]
+    np.testing.assert_allclose(drawn[:3], drawn[3:], atol=1e-9)
+
+
+def test_force_marks_the_selected_steps(case):
+    measurement, _ = case
+    _, (ax,) = figures.new_figure(7, 3)
+    figures.draw_force(measurement.time_s, measurement.force_N, [3, 20], ax)
+    np.testing.assert_array_equal(ax.lines[1].get_xdata(), measurement.time_s[[3, 20]])
+
+
+def test_difference_maps_vanish_for_a_perfect_measurement_and_hide_the_unobserved(case):
+    measurement, truth = case
+    axis = axis_history(measurement, truth)
+    for figure in figures.stretch_maps(axis):
+        difference = figure.axes[2].collections[0].get_array()
+        assert np.ma.masked_invalid(difference).mask.any()
+        assert np.nanmax(np.abs(difference)) < 1e-9
+        assert figure.axes[0].collections[0].get_clim() == figure.axes[1].collections[0].get_clim()
+
+
+def test_maps_without_truth_have_one_panel(case):
+    measurement, _ = case
+    for figure in figures.stretch_maps(axis_history(measurement)):
+        assert len(figure.axes) == 2  # the map and its colour bar
+
+
+def test_errors_of_a_perfect_measurement_can_be_drawn(tmp_path):
+    figure, (ax,) = figures.new_figure(7, 3)
+    figures.draw_errors(np.zeros((5, 3)), ax)
+    figure.savefig(tmp_path / "errors.png")
+
+
+def test_errors_by_step(case):
+    measurement, truth = case
+    figure, (ax,) = figures.new_figure(7, 3)
+    figures.draw_errors(point_errors(measurement, truth).by_step() + 0.01, ax)
+    assert [line.get_label() for line in ax.lines] == ["across the beam", "vertical", "along the beam"]
+    figure.draw_without_rendering()
+
+
+def test_snr_without_known_noise_has_no_limit_line(case):
+    measurement, _ = case
+    unknown = np.full(records.STEPS, np.nan)
+    _, (ax,) = figures.new_figure(7, 3)
+    m = measurement
+    figures.draw_snr(m.snr_initial_db, m.snr_rigid_db, m.snr_final_db, unknown, float("nan"), ax)
+    assert len(ax.lines) == 3
+
+
+def test_radiographs_show_the_used_window(case):
+    measurement, _ = case
+    images = np.random.default_rng(1).random((2, 80, 40))
+    figure, axes = figures.new_figure(6, 4, 2)
+    figures.draw_radiographs(images, ["a", "b"], axes, window=measurement.window)
+    np.testing.assert_array_equal(axes[0].lines[0].get_xdata(), np.array([6, 34, 34, 6, 6]) - 0.5)
+    figure.draw_without_rendering()

@@ -1,0 +1,144 @@
+"""Motion of the material on the rotation axis, measured and true, for the history figures and the strain.
+
+The measured u is a function of the *current* position x. A material point X that moved to x = X + U(X, t)
+is therefore asked for at x, and what comes back is compared with U(X, t).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.measurement import Measurement, MeasurementError
+
+Floats = NDArray[np.float64]
+
+
+class TruePoints(Protocol):
+    """Be asked for the true motion of material points."""
+
+    @property
+    def point_mm(self) -> Floats:
+        """Return the reference positions X (point, 3), mm."""
+
+    @property
+    def displacement_mm(self) -> Floats:
+        """Return U(X, t) (step, point, 3), mm."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisHistory:
+    """Hold the motion of points on the axis, one at each level; NaN where it was not observed."""
+
+    level_mm: Floats
+    """Heights (level,), increasing: of the material in the reference state where a truth is known, else of
+    the sections."""
+    measured: Floats
+    """u (step, level, 3), voxels."""
+    true: Floats | None
+    """U (step, level, 3), voxels; NaN where `measured` is, so that both are averaged over the same points."""
+    voxel_mm: float
+
+    def translation(self, displacement: Floats) -> Floats:
+        """Return the mean over the levels (step, 3), voxels."""
+        return nan_mean(displacement, axis=1)
+
+    def stretch(self, displacement: Floats) -> Floats:
+        """Return u_z without its mean over the levels (step, level), voxels.
+
+        On the axis a small rotation moves nothing vertically, so that the mean is all of the rigid motion.
+        """
+        vertical = displacement[..., 2]
+        return np.asarray(vertical - nan_mean(vertical, axis=1)[:, None])
+
+    def strain(self, displacement: Floats) -> Floats:
+        """Return the engineering strain between neighbouring levels (step, level - 1), without unit."""
+        return np.diff(displacement[..., 2] * self.voxel_mm, axis=1) / np.diff(self.level_mm)
+
+
+def measured_at(measurement: Measurement, points_mm: Floats) -> Floats:
+    """Evaluate u at current positions (step, point, 3), mm; returns (step, point, 3), voxels.
+
+    NaN for points outside the observed sections, and for those whose motion an unobserved section shares.
+    """
+    basis = measurement.basis
+    known = np.all(np.isfinite(measurement.amplitude), axis=2) & measurement.observed
+    lowest, highest = observed_range(measurement)
+    result = np.empty(points_mm.shape)
+    for step, points in enumerate(points_mm):
+        amplitude = np.where(known[step][:, None], measurement.amplitude[step], 0.0)
+        result[step] = basis.displacement(amplitude, points)
+        height = points[:, 2]
+        unknown = basis.weights(height)[:, ~known[step]].sum(axis=1) > 0
+        result[step, unknown | (height < lowest) | (height > highest)] = np.nan
+    return result
+
+
+def observed_range(measurement: Measurement) -> tuple[float, float]:
+    """Return the heights of the lowest and the highest observed section, mm."""
+    heights = measurement.basis.height_mm[measurement.observed]
+    if len(heights) == 0:
+        raise MeasurementError("measurement: expected at least one observed section, found none")
+    if len(measurement.basis.height_mm) == 1:
+        return -np.inf, np.inf
+    return float(heights[0]), float(heights[-1])
+
+
+def current_positions(truth: TruePoints) -> Floats:
+    """Return x = X + U(X, t) (step, point, 3), mm."""
+    return np.asarray(truth.point_mm[None] + truth.displacement_mm)
+
+
+def axis_history(measurement: Measurement, truth: TruePoints | None = None) -> AxisHistory:
+    """Follow the axis through the test: material levels about a section apart, or the sections themselves."""
+    if truth is None:
+        return _at_sections(measurement)
+    chosen = _points_on_axis(truth.point_mm, _section_spacing(measurement))
+    true = truth.displacement_mm[:, chosen]
+    measured = measured_at(measurement, truth.point_mm[chosen][None] + true)
+    return AxisHistory(
+        level_mm=truth.point_mm[chosen, 2],
+        measured=measured,
+        true=np.where(np.isfinite(measured), true / measurement.voxel_mm, np.nan),
+        voxel_mm=measurement.voxel_mm,
+    )
+
+
+def _at_sections(measurement: Measurement) -> AxisHistory:
+    height = measurement.basis.height_mm
+    points = np.zeros((len(measurement.angle_rad), len(height), 3))
+    points[..., 2] = height
+    return AxisHistory(
+        level_mm=height,
+        measured=measured_at(measurement, points),
+        true=None,
+        voxel_mm=measurement.voxel_mm,
+    )
+
+
+def _section_spacing(measurement: Measurement) -> float:
+    height = measurement.basis.height_mm
+    return float(np.mean(np.diff(height))) if len(height) > 1 else 0.0
+
+
+def _points_on_axis(point_mm: Floats, spacing_mm: float) -> NDArray[np.intp]:
+    """Return the points nearest the axis, from the bottom up, levels about `spacing_mm` apart."""
+    from_axis = np.hypot(point_mm[:, 0], point_mm[:, 1])
+    order = np.lexsort((from_axis, np.round(point_mm[:, 2], 6)))
+    height = np.round(point_mm[order, 2], 6)
+    first = order[np.concatenate([[True], np.diff(height) > 0])]
+    if len(first) < 2:
+        return first
+    stride = max(1, round(spacing_mm / float(np.mean(np.diff(point_mm[first, 2])))))
+    return first[(len(first) - 1) % stride // 2 :: stride]
+
+
+def nan_mean(values: Floats, axis: int | None = None) -> Floats:
+    """Average what is a number; NaN, without a warning, where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    total = np.where(known, values, 0.0).sum(axis=axis)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

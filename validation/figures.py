@@ -1,0 +1,228 @@
+"""Figures after the paper's 3 to 10: each `draw_x` draws data on axes that the caller gives.
+
+Nothing here keeps state: figures are made by `new_figure` and saved by the caller, without pyplot.
+Colours are those of Okabe and Ito, which colour-blind readers tell apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from numpy.typing import ArrayLike, NDArray
+
+from validation.axis import AxisHistory
+
+Floats = NDArray[np.float64]
+
+BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#777777"
+TRUTH = {"color": "black", "linewidth": 1.0, "linestyle": (0, (4, 2))}
+UNOBSERVED = "#d9d9d9"
+
+
+def new_figure(width_in: float, height_in: float, columns: int = 1) -> tuple[Figure, list[Axes]]:
+    """Make a figure with a row of axes; the caller saves it with `Figure.savefig`."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, list(figure.subplots(1, columns, squeeze=False)[0])
+
+
+def draw_radiographs(
+    images: Sequence[NDArray[np.floating]],
+    titles: Sequence[str],
+    axes: Sequence[Axes],
+    *,
+    window: tuple[int, int, int, int] | None = None,
+) -> AxesImage:
+    """Draw normalised radiographs (row, column), air 0 and largest attenuation 1, and the used window."""
+    for ax, image, title in zip(axes, images, titles, strict=True):
+        shown = ax.imshow(image, cmap="gray_r", vmin=0, vmax=1, interpolation="nearest")
+        _as_picture(ax, title)
+        if window is not None:
+            top, bottom, left, right = window
+            x, y = (
+                np.array([left, right, right, left, left]) - 0.5,
+                np.array([top, top, bottom, bottom, top]) - 0.5,
+            )
+            ax.plot(x, y, color=VERMILION, linewidth=1.2)
+    axes[0].figure.colorbar(shown, ax=list(axes), label="attenuation / largest", shrink=0.85)
+    return shown
+
+
+def draw_force(time_s: ArrayLike, force_N: ArrayLike, selected: Sequence[int], ax: Axes) -> Axes:
+    """Draw the measured force against time, and the selected steps."""
+    time, force = np.asarray(time_s), np.asarray(force_N)
+    ax.plot(time, force, color=BLUE, marker=".", markersize=3, linewidth=1)
+    ax.plot(time[list(selected)], force[list(selected)], "o", color=VERMILION, label="steps shown above")
+    for step in selected:
+        ax.annotate(
+            f"step {step}", (time[step], force[step]), xytext=(-8, 6), textcoords="offset points", ha="right"
+        )
+    ax.set(xlabel="time (s)", ylabel="force (N)")
+    ax.margins(y=0.12)
+    return _tidy(ax)
+
+
+def draw_residuals(
+    fields: Sequence[NDArray[np.floating]], titles: Sequence[str], axes: Sequence[Axes], *, limit: float
+) -> AxesImage:
+    """Draw residual fields (row, column) on one diverging scale from -limit to limit, grey levels."""
+    for ax, field, title in zip(axes, fields, titles, strict=True):
+        shown = ax.imshow(field, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+        _as_picture(ax, title)
+    axes[0].figure.colorbar(
+        shown, ax=list(axes), label="residual (grey levels: air 0, densest 1)", shrink=0.85, extend="both"
+    )
+    return shown
+
+
+def scale_limit(fields: Sequence[NDArray[np.floating]], share: float = 0.998) -> float:
+    """Return a round number that `share` of all |values| stay below."""
+    sizes = np.abs(np.concatenate([np.ravel(field) for field in fields]))
+    sizes = sizes[np.isfinite(sizes)]
+    wanted = float(np.quantile(sizes, share)) if sizes.size else 0.0
+    if wanted <= 0:
+        return 1.0
+    decade = 10.0 ** np.floor(np.log10(wanted))
+    return float(
+        next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= wanted * 0.999)
+    )
+
+
+def draw_translations(axis: AxisHistory, ax: Axes) -> Axes:
+    """Draw the translation averaged over the axis against the step, beside the truth."""
+    measured = axis.translation(axis.measured)
+    for k, (name, colour) in enumerate(zip("xyz", (BLUE, ORANGE, GREEN), strict=True)):
+        ax.plot(measured[:, k], color=colour, linewidth=2, label=rf"$\langle u_{name} \rangle$")
+    if axis.true is not None:
+        for k, values in enumerate(axis.translation(axis.true).T):
+            ax.plot(values, **TRUTH, label="truth" if k == 0 else None)  # type: ignore[arg-type]
+    ax.set(xlabel="step", ylabel="mean translation (voxel)")
+    micrometre = axis.voxel_mm * 1e3
+
+    def to_micrometre(voxels: Any) -> Any:
+        return voxels * micrometre
+
+    def to_voxel(micrometres: Any) -> Any:
+        return micrometres / micrometre
+
+    second = ax.secondary_yaxis("right", functions=(to_micrometre, to_voxel))
+    second.set_ylabel("(µm)")
+    ax.legend(frameon=False, ncols=2)
+    return _tidy(ax, right=True)
+
+
+def draw_snr(
+    initial: ArrayLike, rigid: ArrayLike, final: ArrayLike, noise: ArrayLike, reprojection: float, ax: Axes
+) -> Axes:
+    """Draw the SNR of each step (step,) at the three stages, dB, and the two limits."""
+    curves = ((final, GREEN, "final"), (rigid, BLUE, "after rigid motions"), (initial, ORANGE, "initial"))
+    for values, colour, name in curves:
+        known = np.asarray(values, dtype=float)
+        mean = known[np.isfinite(known)].mean() if np.isfinite(known).any() else np.nan
+        ax.plot(known, color=colour, linewidth=1.6, label=f"{name}: mean {mean:.1f} dB")
+    limit = np.asarray(noise, dtype=float)
+    if np.isfinite(limit).any():
+        ax.plot(limit, **TRUTH, label="limit set by noise")  # type: ignore[arg-type]
+    if np.isfinite(reprojection):
+        ax.axhline(
+            reprojection,
+            color=GREY,
+            linewidth=1.2,
+            linestyle=":",
+            label=f"re-projection: {reprojection:.1f} dB",
+        )
+    ax.set(xlabel="step", ylabel="SNR (dB)")
+    ax.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return _tidy(ax)
+
+
+def draw_errors(by_step: Floats, ax: Axes) -> Axes:
+    """Draw the rms error of each step (step, direction), voxels, on a logarithmic scale."""
+    names = ("across the beam", "vertical", "along the beam")
+    for values, name, colour in zip(by_step.T, names, (BLUE, GREEN, VERMILION), strict=True):
+        ax.plot(np.where(values > 0, values, np.nan), color=colour, linewidth=1.6, label=name)
+    if np.isfinite(by_step).any() and np.nanmax(by_step) > 0:
+        ax.set_yscale("log")
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.set(xlabel="step", ylabel="rms error (voxel)")
+    ax.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    ax.grid(axis="y", color="#e5e5e5", linewidth=0.8)
+    return _tidy(ax)
+
+
+def draw_maps(
+    level_edges_mm: Floats,
+    measured: Floats,
+    true: Floats | None,
+    axes: Sequence[Axes],
+    *,
+    label: str,
+    cmap: str = "viridis",
+) -> None:
+    """Draw a field (step, level) over step and height, beside its truth and their difference.
+
+    Measured and true share one scale; the difference has its own. Grey is what was not observed.
+    """
+    shown = [("measured", measured, cmap)]
+    if true is not None:
+        shown += [("truth", true, cmap), ("measured - truth", measured - true, "RdBu_r")]
+    both = np.concatenate([measured.ravel(), measured.ravel() if true is None else true.ravel()])
+    both = both[np.isfinite(both)] if np.isfinite(both).any() else np.zeros(1)
+    low, high = float(both.min()), float(both.max())
+    steps = np.arange(len(measured) + 1) - 0.5
+    for ax, (title, values, colours) in zip(axes, shown, strict=True):
+        limit = scale_limit([values], 1.0)
+        span = (-limit, limit) if "truth" in title and "measured" in title else (low, high)
+        mesh = ax.pcolormesh(steps, level_edges_mm, values.T, cmap=colours, vmin=span[0], vmax=span[1])
+        ax.set_facecolor(UNOBSERVED)
+        ax.set(title=title, xlabel="step")
+        ax.figure.colorbar(mesh, ax=ax, label=label)
+    axes[0].set_ylabel("height on the axis (mm)")
+
+
+def stretch_maps(axis: AxisHistory) -> tuple[Figure, Figure]:
+    """Draw u_z without rigid motion, and the strain, as two figures with one or three maps."""
+    columns = 1 if axis.true is None else 3
+    true_u = None if axis.true is None else axis.stretch(axis.true)
+    true_e = None if axis.true is None else axis.strain(axis.true) * 100
+    first, axes = new_figure(3.9 * columns, 3.3, columns)
+    draw_maps(_edges(axis.level_mm), axis.stretch(axis.measured), true_u, axes, label="$u_z$ (voxel)")
+    second, axes = new_figure(3.9 * columns, 3.3, columns)
+    draw_maps(
+        axis.level_mm,
+        axis.strain(axis.measured) * 100,
+        true_e,
+        axes,
+        label=r"$\varepsilon_{zz}$ (%)",
+        cmap="inferno",
+    )
+    return first, second
+
+
+def _edges(level_mm: Floats) -> Floats:
+    middle = (level_mm[1:] + level_mm[:-1]) / 2
+    return np.concatenate(
+        [[1.5 * level_mm[0] - 0.5 * level_mm[1]], middle, [1.5 * level_mm[-1] - 0.5 * level_mm[-2]]]
+    )
+
+
+def _as_picture(ax: Axes, title: str) -> None:
+    ax.set_title(title, fontsize=10)
+    ax.set_xlabel("column (px)")
+    if ax.get_subplotspec() is None or ax.get_subplotspec().is_first_col():  # type: ignore[union-attr]
+        ax.set_ylabel("row (px)")
+
+
+def _tidy(ax: Axes, *, right: bool = False) -> Axes:
+    ax.spines["top"].set_visible(False)
+    ax.spines["right"].set_visible(right)
+    return ax

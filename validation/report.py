@@ -1,0 +1,146 @@
+"""The report: one self-contained HTML page, its figures also as files, for a reader who did not run it."""
+
+from __future__ import annotations
+
+import base64
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+import numpy as np
+
+from pdvc.experiment import Experiment
+from pdvc.measurement import Measurement
+from validation.axis import TruePoints, axis_history, nan_mean
+from validation.pictures import pictures
+from validation.scores import Scores, mean_snr
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Hold one line of the summary table, as text."""
+
+    name: str
+    here: str
+    paper: str = ""
+
+
+def write_report(
+    folder: Path,
+    measurement: Measurement,
+    *,
+    experiment: Experiment | None = None,
+    truth: TruePoints | None = None,
+    scores: Scores | None = None,
+) -> Path:
+    """Write report.html and figures/*.png into the folder; returns the page's path.
+
+    Without a truth the page shows the measurement alone; without the experiment it lacks the radiographs.
+    """
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    shown = []
+    for picture in pictures(measurement, experiment, truth):
+        path = folder / "figures" / f"{picture.name}.png"
+        picture.figure.savefig(path, dpi=130)
+        data = base64.b64encode(path.read_bytes()).decode("ascii")
+        shown.append({"name": picture.name, "caption": picture.caption, "data": data})
+    page = folder / "report.html"
+    partial = page.with_name(page.name + ".partial")
+    partial.write_text(_page(measurement, scores, shown), encoding="utf-8")
+    partial.replace(page)
+    return page
+
+
+def _page(measurement: Measurement, scores: Scores | None, shown: list[dict[str, str]]) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("validation"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html").render(
+        title=scores.scenario if scores else measurement.title,
+        m=measurement,
+        scores=scores,
+        rows=summary_rows(measurement, scores),
+        pictures=shown,
+        motions=_observability(measurement),
+        unobserved=[f"{z:.2f}" for z in measurement.basis.height_mm[~measurement.observed]],
+        voxel_um=f"{measurement.voxel_mm * 1e3:.2f}",
+    )
+
+
+def summary_rows(measurement: Measurement, scores: Scores | None) -> list[Row]:
+    """Return the lines of the summary, beside the paper's numbers where it has one."""
+    snr = mean_snr(measurement)
+    modes = {stage.name: stage.modes for stage in measurement.stages}
+    rows = [
+        Row(name="SNR re-projection, dB", here=_number(snr.reprojection, 2), paper="21.70"),
+        Row(name="SNR initial, dB", here=_number(snr.initial, 2), paper="9.94"),
+        Row(name="SNR after rigid motions, dB", here=_number(snr.rigid, 2), paper="25.4"),
+        Row(name="SNR final, dB", here=_number(snr.final, 2), paper="26.7"),
+        Row(name="SNR that noise alone would leave, dB", here=_number(snr.noise_limit, 2)),
+        Row(name="rigid modes", here=str(modes.get("rigid", 0)), paper="8"),
+        Row(name="deformation modes", here=str(modes.get("deformation", 0)), paper="4"),
+        Row(name="steps", here=str(len(measurement.angle_rad)), paper="127"),
+        Row(name="unknowns", here=str(measurement.unknowns), paper="630"),
+        Row(name="extension, voxel", here=_number(_extension(measurement), 1), paper="about 15"),
+        Row(name="largest strain measured, %", here=_number(_largest_strain(measurement), 2), paper="8 to 9"),
+    ]
+    return rows + (_score_rows(scores) if scores else [])
+
+
+def _score_rows(scores: Scores) -> list[Row]:
+    rows = [Row(name="largest strain true, %", here=_number(scores.max_strain_true * 100, 2))]
+    for name, part in (
+        ("error", scores.error_voxel),
+        ("bias", scores.bias_voxel),
+        ("random", scores.random_voxel),
+    ):
+        for key, words in (
+            ("across_beam", "across the beam"),
+            ("vertical", "vertical"),
+            ("along_beam", "along the beam"),
+        ):
+            rows.append(Row(name=f"{name} {words}, voxel rms", here=_number(getattr(part, key), 4)))
+    rows.append(Row(name="strain error, rms", here=f"{scores.strain_rms:.2e}"))
+    return rows
+
+
+def _extension(measurement: Measurement) -> float:
+    """Return the largest difference of u_z between the ends of the observed axis, voxels."""
+    axis = axis_history(measurement)
+    vertical = axis.measured[..., 2]
+    vertical = vertical[:, np.isfinite(vertical).all(axis=0)]
+    return float(np.abs(vertical[:, -1] - vertical[:, 0]).max()) if vertical.shape[1] > 1 else math.nan
+
+
+def _largest_strain(measurement: Measurement) -> float:
+    """Return the largest strain between sections at any step, %, of the reference length."""
+    axis = axis_history(measurement)
+    current = axis.strain(axis.measured)
+    known = current[np.isfinite(current)]
+    # u is known against the current height z: du/dz = e / (1 + e)
+    return float((known / (1 - known)).max() * 100) if known.size else math.nan
+
+
+def _observability(measurement: Measurement) -> list[dict[str, str]]:
+    share = measurement.data_share[:, measurement.observed]
+    spread = measurement.amplitude_std[:, measurement.observed]
+    return [
+        {
+            "name": name.replace("_", " "),
+            "share": _number(float(nan_mean(share[..., k])) * 100, 1),
+            "lowest": _number(float(np.nanmin(share[..., k])) * 100, 1)
+            if np.isfinite(share[..., k]).any()
+            else "—",
+            "std": _number(float(nan_mean(spread[..., k])), 3),
+        }
+        for k, name in enumerate(measurement.basis.motions)
+    ]
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "—"
