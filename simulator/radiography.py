@@ -1,0 +1,273 @@
+"""Exact path lengths through the deformed object: depths of surface triangles and chords of ellipsoids.
+
+No voxel grid and no marching. The object is turned into the *lab* frame, X = R(theta) x with R a turn by
++theta about z, where the scanner stands still (see `pdvc.geometry`): source S = (-source_axis, 0, 0),
+detector in the plane x = source_detector - source_axis, columns along -y and rows along -z. A ray is
+S + t d with
+
+    d = (1, -U / L, -V / L),    (U, V) = (column_shift, row_shift) + roll . (a, b),    L = source_detector,
+
+where (a, b) are the coordinates of a sub-pixel centre on the detector; t is the depth X - S_x in mm, and a
+length in depth becomes a length along the ray by the factor |d|.
+
+*Surface*: the matrix of a closed surface is the sum of its crossings' depths, + on leaving and - on entering.
+1/t is affine on the image of a plane triangle, so that the depth needs no ray-plane intersection.
+
+*Nodule* {c + A s : |s| <= 1}: with f = d x (c - S), a ray meets it if |adj(A) d|^2 > |A' f|^2, over the chord
+
+    2 |d| |det A| sqrt(|adj(A) d|^2 - |A' f|^2) / |adj(A) d|^2.
+
+Both sides are quadratic in the pixel coordinates, so that the nodule's silhouette is known row by row.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.geometry import ConeBeam
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """Hold the deformed object in the sample frame, as the stage sees it at angle 0."""
+
+    vertices_mm: NDArray[np.float64]
+    """Vertices (v, 3) of the closed surface of the matrix, mm."""
+    faces: NDArray[np.int64]
+    """Triangles (f, 3): vertex numbers, counter-clockwise from outside."""
+    centres_mm: NDArray[np.float64]
+    """Centres (n, 3) of the nodules, mm."""
+    shapes_mm: NDArray[np.float64]
+    """Shapes (n, 3, 3), mm: the nodule is {centre + A s, |s| <= 1}; A = deformation gradient x radius."""
+
+    def __post_init__(self) -> None:
+        v, f, n = len(self.vertices_mm), len(self.faces), len(self.centres_mm)
+        for name, shape in (
+            ("vertices_mm", (v, 3)),
+            ("faces", (f, 3)),
+            ("centres_mm", (n, 3)),
+            ("shapes_mm", (n, 3, 3)),
+        ):
+            found = np.shape(getattr(self, name))
+            if found != shape:
+                raise ValueError(f"body.{name}: expected shape {shape}, got {found}")
+        if f and not (self.faces.min() >= 0 and self.faces.max() < v):
+            raise ValueError(f"body.faces: expected vertex numbers from 0 to {v - 1}")
+
+
+def path_lengths(
+    body: Body, geometry: ConeBeam, angle_rad: float, subpixels: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the lengths of every ray in matrix and in graphite, at the sub-pixel centres.
+
+    Shapes (rows * subpixels, columns * subpixels), mm; matrix = chord of the surface - chords of the nodules.
+    One call uses one thread and releases the interpreter: run radiographs side by side in threads.
+    Raises ValueError where the object reaches the source or the detector.
+    """
+    if subpixels < 1:
+        raise ValueError(f"subpixels: expected at least 1, got {subpixels}")
+    fine = _Screen.of(geometry, subpixels)
+    vertices = _to_lab(body.vertices_mm, angle_rad)
+    centres = _to_lab(body.centres_mm, angle_rad)
+    for points in (vertices, centres):
+        points[:, 0] += geometry.source_axis_mm
+        _check_depth(points[:, 0], geometry, angle_rad)
+    surface = np.zeros((fine.rows, fine.columns))
+    _add_surface(surface, *fine.image_of(vertices), 1 / vertices[:, 0], np.ascontiguousarray(body.faces))
+    graphite = np.zeros((fine.rows, fine.columns), dtype=np.float32)
+    shapes = _to_lab(body.shapes_mm.swapaxes(1, 2), angle_rad)
+    _add_nodules(graphite, centres, shapes, *fine.image_of(centres), *fine.rays())
+    return _lengths(surface, graphite, *fine.rays()), graphite
+
+
+def _check_depth(depth_mm: NDArray[np.float64], geometry: ConeBeam, angle_rad: float) -> None:
+    if len(depth_mm) and not (depth_mm.min() > 0 and depth_mm.max() < geometry.source_detector_mm):
+        raise ValueError(
+            "body: expected between source and detector, "
+            f"0 to {geometry.source_detector_mm} mm from the source, "
+            f"found {depth_mm.min():.6g} to {depth_mm.max():.6g} mm at {angle_rad:.6g} rad"
+        )
+
+
+@dataclass(frozen=True)
+class _Screen:
+    """Be the sub-pixel grid: number q of a centre <-> place (a, b) on the detector <-> ray."""
+
+    rows: int
+    columns: int
+    pitch: float
+    distance: float
+    shift: tuple[float, float]
+    roll: tuple[float, float]
+
+    @classmethod
+    def of(cls, geometry: ConeBeam, subpixels: int) -> _Screen:
+        return cls(
+            rows=geometry.rows * subpixels,
+            columns=geometry.columns * subpixels,
+            pitch=geometry.pixel_mm / subpixels,
+            distance=geometry.source_detector_mm,
+            shift=(geometry.column_shift_mm, geometry.row_shift_mm),
+            roll=(math.cos(geometry.roll_rad), math.sin(geometry.roll_rad)),
+        )
+
+    def image_of(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Project points (n, 3), x counted from the source: fractional column and row numbers (n,)."""
+        depth = points[:, 0]
+        u = -points[:, 1] * self.distance / depth - self.shift[0]
+        v = -points[:, 2] * self.distance / depth - self.shift[1]
+        c, s = self.roll
+        column = (c * u + s * v) / self.pitch + (self.columns - 1) / 2
+        row = (c * v - s * u) / self.pitch + (self.rows - 1) / 2
+        return column, row
+
+    def rays(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return d at sub-pixel (0, 0), and its steps to the next column and to the next row; (3,) each."""
+        c, s = self.roll
+        step = -self.pitch / self.distance
+        by_column = np.array([0.0, c * step, s * step])
+        by_row = np.array([0.0, -s * step, c * step])
+        centre = np.array([1.0, -self.shift[0] / self.distance, -self.shift[1] / self.distance])
+        return centre - by_column * (self.columns - 1) / 2 - by_row * (self.rows - 1) / 2, by_column, by_row
+
+
+def _to_lab(vectors: NDArray[np.float64], angle_rad: float) -> NDArray[np.float64]:
+    """Turn vectors (..., 3) by +angle about z."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    return np.ascontiguousarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_surface(total, column, row, nearness, faces):  # type: ignore[no-untyped-def]
+    """Add the signed crossing depths of each triangle at the sub-pixel centres it covers.
+
+    `nearness` is 1 / depth at each vertex. Watertight by construction: a vertex lies above a row of centres
+    or not, and an edge that changes sides crosses it at one column, always computed from the lower vertex
+    number to the higher. A triangle that is crossed has exactly two such edges, and covers the centres
+    between them, + if the edge that goes down is on the right (a face seen from behind: the ray leaves) and
+    - if it is on the left. Neighbours compute the same crossing of their common edge, so that the signs of
+    every ray of a closed surface sum to zero, whatever the rounding.
+    """
+    rows, columns = total.shape
+    at = np.empty(2)
+    for f in range(len(faces)):
+        top = min(row[faces[f, 0]], row[faces[f, 1]], row[faces[f, 2]])
+        bottom = max(row[faces[f, 0]], row[faces[f, 1]], row[faces[f, 2]])
+        first, last = max(math.ceil(top), 0), min(math.ceil(bottom), rows)
+        if first >= last:
+            continue
+        # 1 / depth = w + gc (column - c0) + gr (row - r0), never outside the range of the three vertices
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        c0, r0, w = column[a], row[a], nearness[a]
+        c1, r1, w1 = column[b] - c0, row[b] - r0, nearness[b] - w
+        c2, r2, w2 = column[c] - c0, row[c] - r0, nearness[c] - w
+        area = c1 * r2 - c2 * r1
+        gc = gr = 0.0
+        if area != 0.0:
+            gc, gr = (w1 * r2 - w2 * r1) / area, (c1 * w2 - c2 * w1) / area
+        low, high = min(w, w + w1, w + w2), max(w, w + w1, w + w2)
+        for i in range(first, last):
+            for k in range(3):
+                p, q = faces[f, k], faces[f, (k + 1) % 3]
+                above_p, above_q = row[p] <= i, row[q] <= i
+                if above_p == above_q:
+                    continue
+                m, n = min(p, q), max(p, q)
+                across = column[m] + (i - row[m]) * ((column[n] - column[m]) / (row[n] - row[m]))
+                at[0 if above_p else 1] = across
+            sign = 1.0 if at[0] > at[1] else -1.0
+            start, stop = max(math.ceil(min(at[0], at[1])), 0), min(math.ceil(max(at[0], at[1])), columns)
+            base = w + gr * (i - r0) - gc * c0
+            for j in range(start, stop):
+                total[i, j] += sign / min(max(base + gc * j, low), high)
+
+
+@numba.njit(cache=True, nogil=True)
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _cross(a, b):  # type: ignore[no-untyped-def]
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@numba.njit(cache=True, nogil=True)
+def _times(a, x, y, z):  # type: ignore[no-untyped-def]
+    """Return (x . a, y . a, z . a)."""
+    return _dot(x, a), _dot(y, a), _dot(z, a)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_nodules(total, centres, shapes, column, row, d0, by_column, by_row):  # type: ignore[no-untyped-def]
+    """Add each nodule's chord, in depth, at the sub-pixel centres of its silhouette.
+
+    `centres` count x from the source; `shapes` hold the columns of A as rows. Around the sub-pixel that is
+    nearest to the centre's image, with (x, y) columns and rows from there, e = adj(A) d and g = A' f are
+    affine, e = e0 + x ex + y ey, so that |e|^2 - |g|^2 = k0 + kx x + ky y + kxx x^2 + kxy x y + kyy y^2,
+    positive inside an ellipse.
+    """
+    rows, columns = total.shape
+    dx, dy = (by_column[0], by_column[1], by_column[2]), (by_row[0], by_row[1], by_row[2])
+    for n in range(len(centres)):
+        jc, ic = round(column[n]), round(row[n])
+        c = (centres[n, 0], centres[n, 1], centres[n, 2])
+        a1 = (shapes[n, 0, 0], shapes[n, 0, 1], shapes[n, 0, 2])
+        a2 = (shapes[n, 1, 0], shapes[n, 1, 1], shapes[n, 1, 2])
+        a3 = (shapes[n, 2, 0], shapes[n, 2, 1], shapes[n, 2, 2])
+        r1, r2, r3 = _cross(a2, a3), _cross(a3, a1), _cross(a1, a2)
+        d = (
+            d0[0] + jc * dx[0] + ic * dy[0],
+            d0[1] + jc * dx[1] + ic * dy[1],
+            d0[2] + jc * dx[2] + ic * dy[2],
+        )
+        e0, ex, ey = _times(d, r1, r2, r3), _times(dx, r1, r2, r3), _times(dy, r1, r2, r3)
+        g0 = _times(_cross(d, c), a1, a2, a3)
+        gx, gy = _times(_cross(dx, c), a1, a2, a3), _times(_cross(dy, c), a1, a2, a3)
+        k0, kx, ky = (
+            _dot(e0, e0) - _dot(g0, g0),
+            2 * (_dot(e0, ex) - _dot(g0, gx)),
+            2 * (_dot(e0, ey) - _dot(g0, gy)),
+        )
+        kxx, kxy, kyy = (
+            _dot(ex, ex) - _dot(gx, gx),
+            2 * (_dot(ex, ey) - _dot(gx, gy)),
+            _dot(ey, ey) - _dot(gy, gy),
+        )
+        # rows where the quadratic in x has real roots: another quadratic, in y
+        m0, m1, m2 = kx * kx - 4 * kxx * k0, kx * kxy - 2 * kxx * ky, kxy * kxy - 4 * kxx * kyy
+        inside = m1 * m1 - m0 * m2
+        if inside <= 0.0 or m2 >= 0.0:
+            continue
+        half = math.sqrt(inside) / -m2
+        first = max(math.ceil(-m1 / m2 - half), -ic)
+        last = min(math.floor(-m1 / m2 + half), rows - 1 - ic)
+        twice_det = 2 * abs(_dot(a1, r1))
+        for y in range(first, last + 1):
+            s0, sx = k0 + y * (ky + y * kyy), (kx + y * kxy) / 2
+            e = (e0[0] + y * ey[0], e0[1] + y * ey[1], e0[2] + y * ey[2])
+            t0, tx, txx = _dot(e, e), 2 * _dot(e, ex), _dot(ex, ex)
+            wide = math.sqrt(max(sx * sx - kxx * s0, 0.0)) / -kxx
+            start = max(math.ceil(-sx / kxx - wide), -jc)
+            stop = min(math.floor(-sx / kxx + wide), columns - 1 - jc)
+            for x in range(start, stop + 1):
+                square = max(s0 + x * (2 * sx + x * kxx), 0.0)
+                total[ic + y, jc + x] += twice_det * math.sqrt(square) / (t0 + x * (tx + x * txx))
+
+
+@numba.njit(cache=True, nogil=True)
+def _lengths(surface, graphite, d0, by_column, by_row):  # type: ignore[no-untyped-def]
+    """Turn depths into lengths, by the factor |d|: graphite in place, matrix as the returned array."""
+    matrix = np.empty(surface.shape, dtype=np.float32)
+    for i in range(surface.shape[0]):
+        for j in range(surface.shape[1]):
+            y, z = d0[1] + j * by_column[1] + i * by_row[1], d0[2] + j * by_column[2] + i * by_row[2]
+            length = math.sqrt(1.0 + y * y + z * z)
+            matrix[i, j] = length * (surface[i, j] - graphite[i, j])
+            graphite[i, j] = length * graphite[i, j]
+    return matrix
