@@ -62,9 +62,7 @@ def tensile_history(steps: int = STEPS) -> tuple[Floats, Floats]:
     return 0.08 * load, offset
 
 
-def measurement(
-    amplitude: Floats, *, unobserved: tuple[int, ...] = (), title: str = "synthetic"
-) -> Measurement:
+def measurement(amplitude: Floats, *, unobserved: tuple[int, ...] = (), title: str = "synthetic") -> Measurement:
     """Return a complete record around section amplitudes (step, section, motion), voxels."""
     steps, sections, motions = amplitude.shape
     rng = np.random.default_rng(3)

@@ -61,9 +61,7 @@ def draw_force(time_s: ArrayLike, force_N: ArrayLike, selected: Sequence[int], a
     ax.plot(time, force, color=BLUE, marker=".", markersize=3, linewidth=1)
     ax.plot(time[list(selected)], force[list(selected)], "o", color=VERMILION, label="steps shown above")
     for step in selected:
-        ax.annotate(
-            f"step {step}", (time[step], force[step]), xytext=(-8, 6), textcoords="offset points", ha="right"
-        )
+        ax.annotate(f"step {step}", (time[step], force[step]), xytext=(-8, 6), textcoords="offset points", ha="right")
     ax.set(xlabel="time (s)", ylabel="force (N)")
     ax.margins(y=0.12)
     return _tidy(ax)
@@ -90,9 +88,7 @@ def scale_limit(fields: Sequence[NDArray[np.floating]], share: float = 0.998) ->
     if wanted <= 0:
         return 1.0
     decade = 10.0 ** np.floor(np.log10(wanted))
-    return float(
-        next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= wanted * 0.999)
-    )
+    return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= wanted * 0.999))
 
 
 def draw_translations(axis: AxisHistory, ax: Axes) -> Axes:
@@ -210,9 +206,7 @@ def stretch_maps(axis: AxisHistory) -> tuple[Figure, Figure]:
 
 def _edges(level_mm: Floats) -> Floats:
     middle = (level_mm[1:] + level_mm[:-1]) / 2
-    return np.concatenate(
-        [[1.5 * level_mm[0] - 0.5 * level_mm[1]], middle, [1.5 * level_mm[-1] - 0.5 * level_mm[-2]]]
-    )
+    return np.concatenate([[1.5 * level_mm[0] - 0.5 * level_mm[1]], middle, [1.5 * level_mm[-1] - 0.5 * level_mm[-2]]])
 
 
 def _as_picture(ax: Axes, title: str) -> None:

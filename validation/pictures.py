@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pdvc.experiment import Experiment
 from pdvc.measurement import Measurement
+from pdvc.radiographs import calibrate, grey_levels
 from validation import figures as draw
 from validation.axis import AxisHistory, TruePoints, axis_history, nan_mean
 from validation.scores import point_errors
@@ -29,9 +30,7 @@ class Picture:
     figure: Figure
 
 
-def pictures(
-    measurement: Measurement, experiment: Experiment | None, truth: TruePoints | None
-) -> list[Picture]:
+def pictures(measurement: Measurement, experiment: Experiment | None, truth: TruePoints | None) -> list[Picture]:
     """Draw all figures that the data allow, in the paper's order."""
     steps = selected_steps(len(measurement.angle_rad))
     axis = axis_history(measurement, truth)
@@ -51,9 +50,8 @@ def selected_steps(steps: int) -> list[int]:
 
 
 def _radiographs(measurement: Measurement, experiment: Experiment, steps: Sequence[int]) -> Picture:
-    dark = experiment.darks.mean(axis=0)
-    flat = np.maximum(experiment.flats.mean(axis=0) - dark, 1.0)
-    images = [-np.log(np.maximum(experiment.test.counts[step] - dark, 1.0) / flat) for step in steps]
+    calibration = calibrate(experiment)
+    images = [grey_levels(experiment.test.counts[step], calibration) for step in steps]
     largest = max(float(np.quantile(image, 0.9995)) for image in images)
     figure = _row(
         images,
@@ -146,11 +144,7 @@ def _snr(measurement: Measurement) -> Picture:
 
 def _maps(axis: AxisHistory) -> list[Picture]:
     displacement, strain = draw.stretch_maps(axis)
-    where = (
-        "at the sections"
-        if axis.true is None
-        else "of material points on the axis, by their reference height"
-    )
+    where = "at the sections" if axis.true is None else "of material points on the axis, by their reference height"
     return [
         Picture(
             name="fig10a_vertical_displacement",
@@ -188,6 +182,5 @@ def _row(images: Sequence[NDArray[Any]], paint: Callable[[list[Any]], object]) -
 def _titles(measurement: Measurement, steps: Sequence[int]) -> list[str]:
     degrees = np.rad2deg(measurement.angle_rad)
     return [
-        f"step {step}, {(degrees[step] + 180) % 360 - 180:.1f}°\n{measurement.force_N[step]:.0f} N"
-        for step in steps
+        f"step {step}, {(degrees[step] + 180) % 360 - 180:.1f}°\n{measurement.force_N[step]:.0f} N" for step in steps
     ]

@@ -65,6 +65,7 @@ def _page(measurement: Measurement, scores: Scores | None, shown: list[dict[str,
         m=measurement,
         scores=scores,
         rows=summary_rows(measurement, scores),
+        errors=_error_table(scores, measurement.voxel_mm * 1e3) if scores else [],
         pictures=shown,
         motions=_observability(measurement),
         unobserved=[f"{z:.2f}" for z in measurement.basis.height_mm[~measurement.observed]],
@@ -93,20 +94,24 @@ def summary_rows(measurement: Measurement, scores: Scores | None) -> list[Row]:
 
 
 def _score_rows(scores: Scores) -> list[Row]:
-    rows = [Row(name="largest strain true, %", here=_number(scores.max_strain_true * 100, 2))]
-    for name, part in (
-        ("error", scores.error_voxel),
-        ("bias", scores.bias_voxel),
-        ("random", scores.random_voxel),
-    ):
-        for key, words in (
-            ("across_beam", "across the beam"),
-            ("vertical", "vertical"),
-            ("along_beam", "along the beam"),
-        ):
-            rows.append(Row(name=f"{name} {words}, voxel rms", here=_number(getattr(part, key), 4)))
-    rows.append(Row(name="strain error, rms", here=f"{scores.strain_rms:.2e}"))
-    return rows
+    return [
+        Row(name="largest strain true, %", here=_number(scores.max_strain_true * 100, 2)),
+        Row(name="strain error, rms", here=f"{scores.strain_rms:.2e}"),
+    ]
+
+
+def _error_table(scores: Scores, voxel_um: float) -> list[list[str]]:
+    """Return a line for each direction: error in voxels and micrometres, bias and random part in voxels."""
+    return [
+        [
+            key.replace("_", " "),
+            _number(getattr(scores.error_voxel, key), 4),
+            _number(getattr(scores.error_voxel, key) * voxel_um, 3),
+            _number(getattr(scores.bias_voxel, key), 4),
+            _number(getattr(scores.random_voxel, key), 4),
+        ]
+        for key in ("across_beam", "vertical", "along_beam")
+    ]
 
 
 def _extension(measurement: Measurement) -> float:
@@ -133,9 +138,7 @@ def _observability(measurement: Measurement) -> list[dict[str, str]]:
         {
             "name": name.replace("_", " "),
             "share": _number(float(nan_mean(share[..., k])) * 100, 1),
-            "lowest": _number(float(np.nanmin(share[..., k])) * 100, 1)
-            if np.isfinite(share[..., k]).any()
-            else "—",
+            "lowest": _number(float(np.nanmin(share[..., k])) * 100, 1) if np.isfinite(share[..., k]).any() else "—",
             "std": _number(float(nan_mean(spread[..., k])), 3),
         }
         for k, name in enumerate(measurement.basis.motions)

@@ -1,0 +1,299 @@
+"""The command line, pdvc-bench; what takes long to import is imported by the command that needs it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from pdvc.measure import MeasureOptions
+    from simulator.truth import Truth
+    from validation.console import ProgressBars
+
+app = typer.Typer(
+    name="pdvc-bench",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    help="""Measure the motion of a sample from one radiograph per load step (P-DVC), and know how far to trust it.
+
+    A **scenario** describes an experiment whose truth is known; **simulate** carries it out; **measure**
+    recovers the motion from the radiographs alone; **score** compares both; **run** does all in turn.
+
+    Start with:  `pdvc-bench run quick -o out/quick`
+
+    Your own radiographs:  `pdvc-bench measure my-experiment -o motion.nc`
+    """,
+)
+
+debugging = False
+
+ScenarioName = Annotated[
+    str, typer.Argument(metavar="SCENARIO", help="A built-in name (see: scenarios), or the path of a TOML file.")
+]
+ExperimentFolder = Annotated[
+    Path, typer.Argument(metavar="DIR", help="An experiment folder: experiment.toml and its TIFF stacks.")
+]
+MeasurementFile = Annotated[Path, typer.Argument(metavar="FILE", help="A measurement, as written by measure.")]
+Options = Annotated[
+    Path | None,
+    typer.Option("--options", metavar="TOML", help="How to measure; the defaults are what 'options' prints."),
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        "--threads", min=1, metavar="N", help="Processor cores to use; all, unless given. Changes no result."
+    ),
+]
+
+
+@app.callback()
+def _common(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the whole traceback of an error.")] = False,
+) -> None:
+    global debugging
+    debugging = debug
+
+
+@app.command()
+def scenarios(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[SCENARIO]", help="Print this one as TOML, to start your own from.")
+    ] = None,
+) -> None:
+    """List the built-in scenarios, or print one as TOML with every key explained.
+
+    Example:  `pdvc-bench scenarios quick > mine.toml`
+    """
+    with _answering():
+        from simulator.scenario import builtin_names, load_scenario
+
+        if name is not None:
+            print(load_scenario(name).template(), end="")
+            return
+        names = list(builtin_names())
+        width = max(len(each) for each in names)
+        for each in names:
+            print(f"{each:{width}}  {load_scenario(each).title}")
+
+
+@app.command()
+def options() -> None:
+    """Print how measure works unless told otherwise, as TOML with every key explained.
+
+    Example:  `pdvc-bench options > options.toml`, then change it and give it to --options.
+    """
+    with _answering():
+        from pdvc.measure import MeasureOptions
+
+        print(MeasureOptions().template(), end="")
+
+
+@app.command()
+def simulate(
+    scenario: ScenarioName,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="The experiment folder to write.")],
+    threads: Threads = None,
+) -> None:
+    """Carry out a scenario: write radiographs as a scanner would, and the truth apart from them.
+
+    Example:  `pdvc-bench simulate quick -o out/quick/experiment`
+    """
+    with _answering() as progress:
+        from simulator.scanner import simulate as carry_out
+        from simulator.scenario import load_scenario
+
+        chosen = load_scenario(scenario)
+        _use_threads(threads)
+        carry_out(chosen, out, progress=progress, workers=threads)
+    _tell(f"experiment: {out}")
+
+
+@app.command()
+def measure(
+    experiment: ExperimentFolder,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The measurement to write (NetCDF).")],
+    options: Options = None,
+    work: Annotated[
+        Path | None,
+        typer.Option(
+            "--work",
+            metavar="DIR",
+            help="Keep intermediate results here. Unless given: beside FILE, and removed at the end.",
+        ),
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Measure the motion of the sample at every load step, from the radiographs alone.
+
+    The folder may come from simulate or from a laboratory; the truth, if there is one, is not looked at.
+
+    Example:  `pdvc-bench measure out/quick/experiment -o motion.nc`
+    """
+    with _answering() as progress:
+        import shutil
+
+        from pdvc.experiment import read_experiment
+        from pdvc.measure import measure as recover
+        from pdvc.measurement import write_measurement
+
+        chosen = _read_options(options)
+        opened = read_experiment(experiment)
+        _use_threads(threads)
+        kept = work or out.with_name(out.name + ".work")
+        write_measurement(recover(opened, chosen, progress=progress, work=kept), out)
+        if work is None:
+            shutil.rmtree(kept, ignore_errors=True)
+    _tell(f"measurement: {out}")
+
+
+@app.command()
+def score(
+    measurement: MeasurementFile,
+    truth: Annotated[
+        Path, typer.Option("--truth", metavar="DIR", help="The simulated experiment folder that was measured.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="JSON", help="Write the scores here, not to the terminal.")
+    ] = None,
+) -> None:
+    """Compare a measurement with the truth: errors, bias, scatter and strain, as JSON.
+
+    Example:  `pdvc-bench score motion.nc --truth out/quick/experiment`
+    """
+    with _answering():
+        from pdvc.measurement import read_measurement
+        from validation.run import write_text
+        from validation.scores import score as compare
+
+        scores = compare(read_measurement(measurement), _read_truth(truth))
+        if out is None:
+            print(scores.to_json(), end="")
+        else:
+            write_text(out, scores.to_json())
+
+
+@app.command()
+def report(
+    measurement: MeasurementFile,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where report.html and figures/ go.")],
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", metavar="DIR", help="The simulated experiment folder that was measured."),
+    ] = None,
+    experiment: Annotated[
+        Path | None,
+        typer.Option(
+            "--experiment", metavar="DIR", help="The experiment folder, to show radiographs, where no truth is."
+        ),
+    ] = None,
+) -> None:
+    """Write a self-contained page about a measurement, and its figures as files.
+
+    Example:  `pdvc-bench report motion.nc --truth out/quick/experiment -o out/report`
+    """
+    with _answering():
+        from pdvc.experiment import read_experiment
+        from pdvc.measurement import read_measurement
+        from validation.report import write_report
+        from validation.scores import score as compare
+
+        opened = read_measurement(measurement)
+        known = None if truth is None else _read_truth(truth)
+        folder = experiment or truth
+        page = write_report(
+            out,
+            opened,
+            experiment=None if folder is None else read_experiment(folder),
+            truth=known,
+            scores=None if known is None else compare(opened, known),
+        )
+    _tell(f"report: {page}")
+
+
+@app.command()
+def run(
+    scenario: ScenarioName,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
+    options: Options = None,
+    threads: Threads = None,
+) -> None:
+    """Simulate, measure, score and report, in one folder; what is finished already is not done again.
+
+    Writes DIR/experiment/, measurement.nc, scores.json, report.html and figures/. Interrupted, it goes on where it
+    was when the same command is given again.
+
+    Example:  `pdvc-bench run quick -o out/quick`
+    """
+    with _answering(resume="give the same command again to go on from here") as progress:
+        from simulator.scenario import load_scenario
+        from validation.run import Job
+        from validation.run import run as do
+
+        job = Job(
+            name=Path(scenario).stem,
+            scenario=load_scenario(scenario),
+            options=_read_options(options),
+            folder=out,
+            workers=threads,
+        )
+        _use_threads(threads)
+        outcome = do(job, progress=progress)
+    from rich.console import Console
+
+    from validation.console import summary
+
+    for part in outcome.reused:
+        _tell(f"{part}: finished before, kept")
+    Console().print(summary(outcome.scores))
+    _tell(f"report: {outcome.report}")
+
+
+def _read_truth(folder: Path) -> Truth:
+    from simulator.truth import read_truth
+
+    return read_truth(folder)
+
+
+def _read_options(path: Path | None) -> MeasureOptions:
+    from pdvc.measure import MeasureOptions
+
+    return MeasureOptions() if path is None else MeasureOptions.read(path)
+
+
+def _use_threads(count: int | None) -> None:
+    if count is None:
+        return
+    import numba
+
+    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    if count > most:
+        raise ValueError(f"--threads: expected 1 to {most} on this machine, given {count}")
+    numba.set_num_threads(count)
+
+
+@contextmanager
+def _answering(resume: str = "nothing half-written was left under its final name") -> Iterator[ProgressBars]:
+    """Show progress on stderr, and errors there in one line."""
+    from rich.console import Console
+
+    from validation.console import ProgressBars, one_line_errors
+
+    console = Console(stderr=True)
+    with one_line_errors(console, resume=resume, debug=debugging), ProgressBars(console) as progress:
+        yield progress
+
+
+def _tell(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+if __name__ == "__main__":
+    app()

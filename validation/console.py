@@ -1,0 +1,134 @@
+"""What the command line shows: progress, the summary, and errors in one line."""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from validation.scores import Scores
+
+INTERRUPTED = 130
+WRONG_INPUT = 2
+FAILED = 1
+
+
+class ProgressBars:
+    """Draw a bar with the remaining time for each task; a line at its end where there is no terminal."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._started: dict[str, float] = {}
+        self._tasks: dict[str, object] = {}
+        self._bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+            speed_estimate_period=120,
+            disable=not console.is_terminal,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def __call__(self, task: str, done: int, total: int) -> None:
+        """Draw that `done` of `total` parts of `task` are finished."""
+        if task not in self._tasks:
+            self._bars.start()
+            self._started[task] = time.monotonic()
+            self._tasks[task] = self._bars.add_task(task, total=total, completed=done)
+        self._bars.update(self._tasks[task], completed=done, total=total)  # type: ignore[arg-type]
+        if done >= total and not self._console.is_terminal and task in self._started:
+            seconds = time.monotonic() - self._started.pop(task)
+            self._console.print(f"{task}: {total} of {total} in {seconds:.1f} s", highlight=False)
+
+
+@contextmanager
+def one_line_errors(console: Console, *, resume: str, debug: bool = False) -> Iterator[None]:
+    """Turn what a user can mend into one line on stderr and an exit code; `debug` shows where it came from.
+
+    2: wrong input; 1: the machine failed (no space, no permission, no memory); 130: interrupted.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        _say(console, f"interrupted; {resume}")
+        raise typer.Exit(INTERRUPTED) from None
+    except (ValueError, MemoryError, OSError) as error:
+        if debug:
+            raise
+        _say(console, f"error: {_explain(error)}")
+        raise typer.Exit(WRONG_INPUT if isinstance(error, ValueError) else FAILED) from None
+
+
+def _explain(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error}"
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename else ""
+        advice = "; make room, then run the same command again" if error.errno == errno.ENOSPC else ""
+        return f"{name}{error.strerror or error}{advice}"
+    # a plain ValueError may be a fault of this program: then its place is wanted
+    hint = " (pdvc-bench --debug COMMAND shows where)" if type(error) is ValueError else ""
+    return " ".join(str(error).split()) + hint
+
+
+def _say(console: Console, text: str) -> None:
+    # soft_wrap keeps it one line, which scripts can search
+    console.print(
+        text, style="red" if text.startswith("error") else None, markup=False, highlight=False, soft_wrap=True
+    )
+
+
+def summary(scores: Scores, report: Path | None = None) -> Table:
+    """Return the scores as a table of one screen."""
+    table = Table(title=f"{scores.scenario}: {scores.steps} steps, {scores.unknowns} unknowns", title_justify="left")
+    for name in ("", "here", "paper"):
+        table.add_column(name, justify="left" if not name else "right")
+    snr, modes = scores.snr_db, scores.modes
+    table.add_row(
+        "SNR re-projection / noise limit, dB", f"{snr.reprojection:.1f} / {snr.noise_limit:.1f}", "21.7 /  - "
+    )
+    table.add_row(
+        "SNR initial / rigid / final, dB",
+        f"{snr.initial:.1f} / {snr.rigid:.1f} / {snr.final:.1f}",
+        "9.9 / 25.4 / 26.7",
+    )
+    table.add_row("modes rigid / deformation", f"{modes.rigid} / {modes.deformation}", "8 / 4")
+    for key in ("across_beam", "vertical", "along_beam"):
+        table.add_row(f"error {key.replace('_', ' ')}, voxel rms", f"{getattr(scores.error_voxel, key):.4f}", "")
+    table.add_row("strain error, rms", f"{scores.strain_rms:.1e}", "")
+    table.add_row(
+        "largest strain measured / true, %",
+        f"{scores.max_strain_measured * 100:.2f} / {scores.max_strain_true * 100:.2f}",
+        "8 to 9",
+    )
+    seconds = scores.seconds
+    table.add_row(
+        "simulate / reconstruct / measure, s",
+        f"{seconds.simulate:.0f} / {seconds.reconstruct:.0f} / {seconds.measure:.0f}",
+        "",
+    )
+    table.add_row("peak memory, GiB", f"{scores.peak_memory_gib:.2f}", "")
+    if report is not None:
+        table.caption = f"report: {report}"
+        table.caption_justify = "left"
+    return table

@@ -1,0 +1,212 @@
+"""The whole job in one folder: simulate, measure, score, report; what is finished is not done again.
+
+DIR/experiment/       the experiment folder, with its truth/
+DIR/measurement.nc    what was measured
+DIR/scores.json       how good it is
+DIR/report.html       for a reader; DIR/figures/*.png holds its figures
+DIR/work/             state.json, and intermediate results of an unfinished measurement
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pdvc.experiment import DESCRIPTION, Experiment, ExperimentError, read_experiment
+from pdvc.measurement import Measurement, read_measurement, write_measurement
+from pdvc.progress import Progress, silent
+from validation.report import write_report
+from validation.scores import Scores, score
+
+if TYPE_CHECKING:
+    from pdvc.measure import MeasureOptions
+    from simulator.scenario import Scenario
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """Hold what is asked for."""
+
+    name: str
+    """Name of the scenario, for titles and scores."""
+    scenario: Scenario
+    options: MeasureOptions
+    folder: Path
+    """Where everything goes."""
+    workers: int | None = None
+    """Processes that simulate; None lets the simulator choose. Results do not depend on it."""
+
+    @property
+    def experiment(self) -> Path:
+        """Return the experiment folder."""
+        return self.folder / "experiment"
+
+    @property
+    def measurement(self) -> Path:
+        """Return the measurement file."""
+        return self.folder / "measurement.nc"
+
+    @property
+    def work(self) -> Path:
+        """Return the folder for what only serves to go on after an interruption."""
+        return self.folder / "work"
+
+
+@dataclass
+class State:
+    """Hold what earlier attempts did in a folder, so that the next one knows what still holds."""
+
+    scenario: str = ""
+    """Fingerprint of the scenario that is in experiment/, finished or not."""
+    measurement: str = ""
+    """Fingerprint of the experiment and options that measurement.nc belongs to."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time spent so far, s, all attempts together."""
+    peak_memory_gib: float = 0.0
+
+    @classmethod
+    def read(cls, path: Path) -> State:
+        """Read the state; an empty one where there is none or it cannot be read."""
+        try:
+            return cls(**json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            return cls()
+
+    def write(self, path: Path) -> None:
+        """Write the state, whole or not at all."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".partial")
+        partial.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
+        partial.replace(path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Hold what a run came to."""
+
+    scores: Scores
+    report: Path
+    reused: tuple[str, ...]
+    """Parts that were finished already: `experiment`, `measurement`."""
+
+
+def run(job: Job, *, progress: Progress = silent) -> Outcome:
+    """Do what is still to be done of a job; called again after an interruption, it goes on there.
+
+    Raises ExperimentError where the folder holds another scenario's experiment.
+    """
+    from simulator.truth import read_truth
+
+    state_path = job.work / "state.json"
+    state = State.read(state_path)
+    reused = []
+    if _simulate(job, state, state_path, progress):
+        reused.append("experiment")
+    experiment = read_experiment(job.experiment)
+    measurement, kept = _measure(job, state, state_path, experiment, progress)
+    if kept:
+        reused.append("measurement")
+    progress("score and report", 0, 1)
+    truth = read_truth(job.experiment)
+    scores = score(
+        measurement,
+        truth,
+        scenario=job.name,
+        simulate_s=state.seconds.get("simulate", math.nan),
+        peak_memory_gib=state.peak_memory_gib,
+    )
+    write_text(job.folder / "scores.json", scores.to_json())
+    report = write_report(job.folder, measurement, experiment=experiment, truth=truth, scores=scores)
+    progress("score and report", 1, 1)
+    return Outcome(scores=scores, report=report, reused=tuple(reused))
+
+
+def _simulate(job: Job, state: State, state_path: Path, progress: Progress) -> bool:
+    """Simulate unless that is done; returns whether it was."""
+    wanted = fingerprint(job.scenario.template())
+    finished = (job.experiment / DESCRIPTION).exists()
+    if job.experiment.exists() and state.scenario != wanted:
+        raise ExperimentError(
+            f"{job.experiment}: expected an experiment of scenario {job.name} as it is now, found another; "
+            "choose another folder, or remove this one"
+        )
+    if finished:
+        return True
+    from simulator.scanner import simulate
+
+    if not job.experiment.exists():
+        state.seconds.pop("simulate", None)
+    state.scenario = wanted
+    state.write(state_path)
+    with _noting("simulate", state, state_path):
+        simulate(job.scenario, job.experiment, progress=progress, workers=job.workers)
+    return False
+
+
+def _measure(
+    job: Job, state: State, state_path: Path, experiment: Experiment, progress: Progress
+) -> tuple[Measurement, bool]:
+    """Measure unless that is done with the same options; returns the measurement and whether it was."""
+    wanted = fingerprint(job.options.template(), *_file_stamps(job.experiment))
+    if job.measurement.exists() and state.measurement == wanted:
+        return read_measurement(job.measurement), True
+    from pdvc.measure import measure
+
+    with _noting("measure", state, state_path):
+        measurement = measure(experiment, job.options, progress=progress, work=job.work / "measure")
+        write_measurement(measurement, job.measurement)
+        state.measurement = wanted
+    return measurement, False
+
+
+@contextmanager
+def _noting(part: str, state: State, path: Path) -> Iterator[None]:
+    """Add the time that a part takes to the state, also when it is interrupted."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        state.seconds[part] = state.seconds.get(part, 0.0) + time.perf_counter() - start
+        state.peak_memory_gib = max(state.peak_memory_gib, peak_memory_gib())
+        state.write(path)
+
+
+def fingerprint(*texts: str) -> str:
+    """Return a short text that differs where any of the texts differs."""
+    digest = hashlib.sha256()
+    for text in texts:
+        digest.update(len(text).to_bytes(8, "big") + text.encode("utf-8"))
+    return digest.hexdigest()[:16]
+
+
+def _file_stamps(folder: Path) -> list[str]:
+    """Return what changes when an experiment's files do: the description's text, the others' size and time."""
+    stamps = [(folder / DESCRIPTION).read_text(encoding="utf-8")]
+    for path in sorted(folder.rglob("*.tif")):
+        status = path.stat()
+        stamps.append(f"{path.relative_to(folder)} {status.st_size} {status.st_mtime_ns}")
+    return stamps
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
+
+
+def peak_memory_gib() -> float:
+    """Return the largest resident memory of this process so far, GiB."""
+    import resource
+
+    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return size / 2**30 if sys.platform == "darwin" else size / 2**20
