@@ -78,10 +78,11 @@ def scenarios(
         if name is not None:
             print(load_scenario(name).template(), end="")
             return
-        names = list(builtin_names())
-        width = max(len(each) for each in names)
-        for each in names:
-            print(f"{each:{width}}  {load_scenario(each).title}")
+        from rich.console import Console
+
+        from validation.console import scenario_table
+
+        Console().print(scenario_table(load_scenario(each) for each in builtin_names()))
 
 
 @app.command()
@@ -238,7 +239,6 @@ def run(
         from validation.run import run as do
 
         job = Job(
-            name=Path(scenario).stem,
             scenario=load_scenario(scenario),
             options=_read_options(options),
             folder=out,

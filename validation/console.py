@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import errno
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import typer
 from rich.console import Console
@@ -16,6 +16,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from validation.scores import Scores
+
+if TYPE_CHECKING:
+    from simulator.scenario import Scenario
 
 INTERRUPTED = 130
 WRONG_INPUT = 2
@@ -131,4 +134,16 @@ def summary(scores: Scores, report: Path | None = None) -> Table:
     if report is not None:
         table.caption = f"report: {report}"
         table.caption_justify = "left"
+    return table
+
+
+def scenario_table(scenarios: Iterable[Scenario]) -> Table:
+    """Return the scenarios as a table, one line each."""
+    table = Table(box=None, pad_edge=False)
+    for name in ("name", "detector, px", "views", "steps", "what it is"):
+        table.add_column(name, justify="right" if name in ("detector, px", "views", "steps") else "left")
+    for each in scenarios:
+        size = f"{each.geometry.rows} x {each.geometry.columns}"
+        plan = each.acquisition
+        table.add_row(each.name, size, str(plan.reference_views), str(plan.test_steps), each.title)
     return table

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 class Job:
     """Hold what is asked for."""
 
-    name: str
-    """Name of the scenario, for titles and scores."""
     scenario: Scenario
     options: MeasureOptions
     folder: Path
@@ -119,7 +117,7 @@ def run(job: Job, *, progress: Progress = silent) -> Outcome:
     scores = score(
         measurement,
         truth,
-        scenario=job.name,
+        scenario=job.scenario.name,
         simulate_s=state.seconds.get("simulate", math.nan),
         peak_memory_gib=state.peak_memory_gib,
     )
@@ -135,7 +133,7 @@ def _simulate(job: Job, state: State, state_path: Path, progress: Progress) -> b
     finished = (job.experiment / DESCRIPTION).exists()
     if job.experiment.exists() and state.scenario != wanted:
         raise ExperimentError(
-            f"{job.experiment}: expected an experiment of scenario {job.name} as it is now, found another; "
+            f"{job.experiment}: expected an experiment of scenario {job.scenario.name} as it is now, found another; "
             "choose another folder, or remove this one"
         )
     if finished:
