@@ -207,12 +207,8 @@ class StackWriter:
             # the whole file is laid out now, so that a full disk is met before the work, not after it
             with tifffile.TiffWriter(self._partial, bigtiff=_too_large(shape)) as tiff:
                 blank = np.zeros(shape[1:], dtype=np.uint16)
-                tiff.write(
-                    (blank for _ in range(shape[0])), shape=shape, dtype=np.uint16, photometric="minisblack"
-                )
-        self._map = (
-            None if self.done == shape[0] else tifffile.memmap(self._partial, mode="r+").reshape(shape)
-        )
+                tiff.write((blank for _ in range(shape[0])), shape=shape, dtype=np.uint16, photometric="minisblack")
+        self._map = None if self.done == shape[0] else tifffile.memmap(self._partial, mode="r+").reshape(shape)
 
     def write(self, index: int, image: NDArray[np.uint16]) -> None:
         """Store the next image, counts (row, column); images come in order."""
@@ -240,7 +236,6 @@ class StackWriter:
             return -1
 
     def _save(self) -> None:
-        assert self._map is not None
         self._map.flush()
         self._count.write_text(str(self.done))
 
@@ -259,7 +254,7 @@ class StackWriter:
             self._count.unlink()
 
 
-def _open_map(path: Path, shape: tuple[int, int, int]) -> np.memmap[Any, np.dtype[np.uint16]]:
+def _open_map(path: Path, shape: tuple[int, int, int]) -> Any:
     pages = tifffile.memmap(path, mode="r+")
     assert isinstance(pages, np.memmap)
     # tifffile drops an axis of length one
@@ -293,8 +288,7 @@ def _stack(path: Path, geometry: ConeBeam) -> NDArray[np.uint16]:
         counts = counts[None]
     if counts.shape[1:] != (geometry.rows, geometry.columns):
         raise ExperimentError(
-            f"{path}: expected (image, {geometry.rows}, {geometry.columns}) as in {DESCRIPTION}, "
-            f"found {counts.shape}"
+            f"{path}: expected (image, {geometry.rows}, {geometry.columns}) as in {DESCRIPTION}, found {counts.shape}"
         )
     return counts
 
@@ -307,9 +301,7 @@ def _read_tiff(path: Path) -> NDArray[Any]:
             series = tiff.series[0]
             needed = series.dataoffset + series.nbytes if series.dataoffset is not None else 0
             if path.stat().st_size < needed:
-                raise ExperimentError(
-                    f"{path}: truncated: expected {needed} bytes, found {path.stat().st_size}"
-                )
+                raise ExperimentError(f"{path}: truncated: expected {needed} bytes, found {path.stat().st_size}")
             if series.dataoffset is not None:
                 return tifffile.memmap(path, mode="r")
             return series.asarray()

@@ -74,9 +74,7 @@ def _fill(table: Any, record: Settings) -> None:
     nested: list[tuple[str, Any, str | None]] = []
     for name, field in type(record).model_fields.items():
         value = getattr(record, name)
-        if isinstance(value, Settings) or (
-            isinstance(value, tuple) and value and isinstance(value[0], Settings)
-        ):
+        if isinstance(value, Settings) or (isinstance(value, tuple) and value and isinstance(value[0], Settings)):
             nested.append((name, value, field.description))
         elif value is not None:
             item = tomlkit.item(list(value) if isinstance(value, tuple) else value)

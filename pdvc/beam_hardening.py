@@ -1,0 +1,152 @@
+"""Beam-hardening polynomial and hull, both from a coarse reconstruction of the reference views themselves.
+
+A polychromatic beam loses its soft part first, so that attenuation q grows less than the path length L through the
+sample. With the sample's outline found in a coarse volume, L is known for every ray, and
+
+    L ~ c1 q + c2 q^2 + c3 q^3                                       (third order, as in section 4.1)
+
+is fitted by least squares; divided by its largest value in the reference views it gives grey levels from 0 to 1.
+The outline of an uncorrected volume is slightly off, so that the fit is done twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pdvc.geometry import ConeBeam
+from pdvc.progress import Progress, silent
+from pdvc.projection import project
+from pdvc.rays import ray_vectors
+from pdvc.reconstruction import fdk, seen_half_height_mm
+from pdvc.sections import SectionBasis
+from pdvc.volume import Grid, Hull, Volume, hull_of
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+SLAB_VOXELS = 4
+"""Height of the hull's slabs in voxels of the coarse volume."""
+_FIT_VIEWS = 24
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """Hold what the coarse reconstruction tells."""
+
+    hull: Hull
+    """Encloses the sample, with a margin of two coarse voxels."""
+    polynomial: tuple[float, float, float]
+    """c1, c2, c3: from attenuation to grey levels, 1 at the largest attenuation."""
+
+
+def find_outline(
+    view: Callable[[int], Image],
+    geometry: ConeBeam,
+    angle_rad: Floats,
+    polynomial: tuple[float, float, float] | None,
+    *,
+    progress: Progress = silent,
+) -> Outline:
+    """Reconstruct coarsely, outline the sample and fit the polynomial, unless one is given.
+
+    `view(i)` returns the attenuation (row, column) of coarse view i, without unit; `geometry` is theirs.
+    A given polynomial is only scaled, so that the largest attenuation becomes 1.
+    """
+    views = [view(i) for i in range(len(angle_rad))]
+    grid = _whole_grid(geometry)
+    fitted = polynomial or (1.0, 0.0, 0.0)
+    for _ in range(1 if polynomial else 2):
+        inside = _inside(views, geometry, angle_rad, grid, fitted, progress)
+        if polynomial is None:
+            fitted = _fit(views, geometry, angle_rad, grid, inside)
+    largest = max(float(_apply(image, fitted).max()) for image in views)
+    hull = hull_of(inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
+    c1, c2, c3 = (c / largest for c in fitted)
+    return Outline(hull=hull, polynomial=(c1, c2, c3))
+
+
+def _apply(attenuation: Image, polynomial: tuple[float, float, float]) -> Image:
+    c1, c2, c3 = (np.float32(c) for c in polynomial)
+    return np.asarray(attenuation * (c1 + attenuation * (c2 + attenuation * c3)), dtype=np.float32)
+
+
+def _whole_grid(geometry: ConeBeam) -> Grid:
+    radius = (geometry.columns / 2 - 1) * geometry.voxel_mm - abs(geometry.column_shift_mm) / geometry.magnification
+    height = seen_half_height_mm(geometry, radius)
+    if radius <= 0 or height <= 0:
+        raise ValueError("geometry: the detector does not see the rotation axis")
+    return Grid.around(np.array([-radius, -radius, -height]), np.array([radius, radius, height]), geometry.voxel_mm)
+
+
+def _inside(
+    views: list[Image],
+    geometry: ConeBeam,
+    angle_rad: Floats,
+    grid: Grid,
+    polynomial: tuple[float, float, float],
+    progress: Progress,
+) -> NDArray[np.bool_]:
+    """Return the voxels (z, y, x) of the sample: above half its level, pores and graphite filled."""
+    everywhere = hull_of(np.ones(grid.shape, dtype=bool), grid, grid.shape[0])
+    values = fdk(
+        lambda i: _apply(views[i], polynomial),
+        geometry,
+        angle_rad,
+        grid,
+        everywhere,
+        progress=progress,
+        task="outline",
+    )
+    inside = ndimage.binary_fill_holes(values > 0.5 * _sample_level(values))
+    labels, count = ndimage.label(inside)
+    if count == 0:
+        raise ValueError("reference radiographs: expected a sample, found only air")
+    sizes = np.bincount(labels.ravel())[1:]
+    return np.asarray(labels == 1 + int(sizes.argmax()))
+
+
+def _sample_level(values: NDArray[np.float32]) -> float:
+    """Return the sample's grey level per mm: the mean above the threshold that Otsu's method finds."""
+    counts, edges = np.histogram(values, bins=256, range=(0.0, float(np.percentile(values, 99.9))))
+    centres = (edges[1:] + edges[:-1]) / 2
+    below, above = np.cumsum(counts), np.cumsum(counts[::-1])[::-1]
+    mean_below = np.cumsum(counts * centres) / np.maximum(below, 1)
+    mean_above = np.cumsum((counts * centres)[::-1])[::-1] / np.maximum(above, 1)
+    between = below[:-1] * above[1:] * (mean_below[:-1] - mean_above[1:]) ** 2
+    split = int(np.argmax(between))
+    return float(mean_above[split + 1])
+
+
+def _fit(
+    views: list[Image], geometry: ConeBeam, angle_rad: Floats, grid: Grid, inside: NDArray[np.bool_]
+) -> tuple[float, float, float]:
+    """Fit path length against attenuation over the middle rows of some views, mm."""
+    hull = hull_of(inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
+    volume = Volume(values=_framed_copy(inside), grid=grid, hull=hull)
+    still = SectionBasis(height_mm=np.zeros(1), radius_mm=1.0)
+    middle = slice(geometry.rows // 5, geometry.rows - geometry.rows // 5)
+    window = geometry.cropped(middle.start, middle.stop, 0, geometry.columns)
+    lengths, attenuations = [], []
+    for i in np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int)):
+        rays = ray_vectors(window, angle_rad[i]).stacked()[0]
+        shape = (window.rows, window.columns)
+        length = project(volume, rays, shape, still, np.zeros(still.shape), voxel_mm=grid.voxel_mm, step=0.5)
+        lengths.append(length.ravel())
+        attenuations.append(views[i][middle].ravel())
+    length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)
+    # edges, where a pixel is only partly covered, say little about the beam
+    deep = length > 0.25 * length.max()
+    q, length = q[deep], length[deep]
+    c1, c2, c3 = np.linalg.lstsq(np.stack([q, q**2, q**3], axis=1), length, rcond=None)[0]
+    return float(c1), float(c2), float(c3)
+
+
+def _framed_copy(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    values = np.zeros(inside.shape, dtype=np.float32)
+    values[1:-1, 1:-1, 1:-1] = inside[1:-1, 1:-1, 1:-1]
+    return values

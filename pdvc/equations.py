@@ -1,0 +1,119 @@
+"""One pass over all radiographs of one scale: the small systems B(t), c(t) that every solver starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.progress import Progress, silent
+from pdvc.projection import normal_equations, project
+from pdvc.sections import SectionBasis
+from pdvc.systematic import Systematic
+from pdvc.volume import Volume
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Images:
+    """Hold the radiographs of one scale, and the volume that is to be matched with them."""
+
+    rays: Floats
+    """RayVectors.stacked() of the used window (step, 4, 3), mm."""
+    grey: Image
+    """Radiographs g (step, row, column), grey levels, of the used window."""
+    weight: Image
+    """Weights (step, row, column), or (1, row, column) where all steps share them; zero: unused; mean about 1."""
+    volume: Volume
+    systematic: Systematic | None
+    """What the volume's re-projection leaves, to be registered and subtracted; None: nothing is."""
+    voxel_mm: float
+    """Voxel in which amplitudes are counted, mm: that of scale 1, whatever this scale."""
+    sampling: float = 1.0
+    """Distance between the points along a ray, in voxels of the volume."""
+
+    @property
+    def used_pixels(self) -> int:
+        """Return the number of pixels, over all steps, whose weight is not zero."""
+        return int(np.count_nonzero(self.weight)) * (len(self.grey) // len(self.weight))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Equations:
+    """Hold B(t), c(t) and the residual at one trial motion."""
+
+    matrix: Floats
+    """B (step, section * motion, section * motion)."""
+    vector: Floats
+    """c (step, section * motion)."""
+    chi2: Floats
+    """Weighted sum of squared residuals of each step (step,)."""
+    residual: Image
+    """rho (step, row, column), grey levels."""
+    pixels: int
+    """Number of used pixels over all steps."""
+
+    @property
+    def rms(self) -> float:
+        """Return the weighted rms residual, grey levels."""
+        return float(np.sqrt(self.chi2.sum() / self.pixels))
+
+
+Linearise = Callable[[Floats], Equations]
+"""From trial amplitudes (step, section, motion) to the equations there."""
+
+
+def linearise(
+    images: Images, basis: SectionBasis, amplitude: Floats, *, progress: Progress = silent, task: str = "pass"
+) -> Equations:
+    """Walk all radiographs once at trial amplitudes (step, section, motion), in voxels."""
+    steps, size = len(images.grey), basis.shape[0] * basis.shape[1]
+    matrix, vector, chi2 = np.empty((steps, size, size)), np.empty((steps, size)), np.empty(steps)
+    residual = np.empty_like(images.grey)
+    for t in range(steps):
+        result = normal_equations(
+            images.volume,
+            images.rays[t],
+            basis,
+            amplitude[t],
+            _target(images, basis, amplitude, t),
+            images.weight[t % len(images.weight)],
+            voxel_mm=images.voxel_mm,
+            step=images.sampling,
+        )
+        matrix[t], vector[t], chi2[t], residual[t] = result.matrix, result.vector, result.chi2, result.residual
+        progress(task, t + 1, steps)
+    return Equations(matrix=matrix, vector=vector, chi2=chi2, residual=residual, pixels=images.used_pixels)
+
+
+def residuals(
+    images: Images, basis: SectionBasis, amplitude: Floats, *, progress: Progress = silent, task: str = "residual"
+) -> Image:
+    """Return the residual fields (step, row, column) alone, at half the cost of a full pass."""
+    result = np.empty_like(images.grey)
+    for t in range(len(images.grey)):
+        shape = (images.grey.shape[1], images.grey.shape[2])
+        model = project(
+            images.volume,
+            images.rays[t],
+            shape,
+            basis,
+            amplitude[t],
+            voxel_mm=images.voxel_mm,
+            step=images.sampling,
+        )
+        result[t] = model - _target(images, basis, amplitude, t)
+        progress(task, t + 1, len(images.grey))
+    return result
+
+
+def _target(images: Images, basis: SectionBasis, amplitude: Floats, t: int) -> Image:
+    """Return what the bare projection should equal: the radiograph plus the registered systematic residual."""
+    if images.systematic is None:
+        return images.grey[t]
+    left = images.systematic.registered(t, images.rays[t], basis, amplitude[t], images.voxel_mm)
+    return np.asarray(images.grey[t] + left, dtype=np.float32)

@@ -1,0 +1,538 @@
+"""Warped projection, residual and projected sensitivities of a radiograph, reduced as they are found.
+
+For one step, with F the reference volume, u the trial motion and a ray x(s) from the source to pixel r,
+
+    P[F~](r)  = int F(x - u(x)) ds                              grey levels
+    rho(r)    = P[F~](r) - g(r)                                 Eq. 2
+    S_i(r)    = int Phi_i(x) . grad F(x - u(x)) ds              Eq. 10, grey levels per voxel
+    B_ij      = sum_r w(r) S_i(r) S_j(r)                        Eq. 11
+    c_i       = sum_r w(r) S_i(r) rho(r)
+
+so that chi2 = sum_r w rho^2 is lowered by the solution of B da = c. Neither S nor the warped volume is stored:
+each ray is walked once, and its sensitivities are added into B and c and forgotten.
+
+The integrals are sums over points that lie `step` voxels apart, with trilinear interpolation of F and the exact
+gradient of that interpolation. Between two sections u is a quadratic polynomial of the ray's arc length, and so
+is everything that multiplies grad F; the sensitivities of all motions follow from nine sums, of
+grad F, l grad F and l^2 grad F, however many motions a section has.
+
+Sums run in single precision along a ray, in double precision over rays. Bands of rows are worked on in
+parallel and added in order, so that the result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from pdvc.sections import SectionBasis
+from pdvc.volume import Hull, Volume
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+BAND_ROWS = 16
+"""Rows of pixels that one task works on; part of the result's definition, as sums are ordered by it."""
+
+_f = np.float32
+_BIG = 1e30
+_NORMALS = Hull.normals()
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepEquations:
+    """Hold what one radiograph says about its step's section amplitudes."""
+
+    matrix: Floats
+    """B (section * motion, section * motion), (grey level / voxel)^2."""
+    vector: Floats
+    """c (section * motion,), grey level^2 / voxel."""
+    chi2: float
+    """Weighted sum of squared residuals, grey level^2."""
+    residual: Image
+    """rho (row, column), grey levels, in every pixel of the window, whatever its weight."""
+
+
+def normal_equations(
+    volume: Volume,
+    rays: Floats,
+    basis: SectionBasis,
+    amplitude: Floats,
+    target: Image,
+    weight: Image,
+    *,
+    voxel_mm: float,
+    step: float = 1.0,
+) -> StepEquations:
+    """Compare a radiograph with the moved volume, and return its normal equations.
+
+    `rays` (4, 3) in mm as of RayVectors.stacked, for the window that `target` (row, column) covers;
+    `amplitude` (section, motion) in voxels of `voxel_mm`; `weight` (row, column), zero for unused pixels;
+    `step` in voxels of the volume.
+    """
+    equations = _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, step, True)
+    assert equations is not None
+    return equations
+
+
+def project(
+    volume: Volume,
+    rays: Floats,
+    shape: tuple[int, int],
+    basis: SectionBasis,
+    amplitude: Floats,
+    *,
+    voxel_mm: float,
+    step: float = 1.0,
+) -> Image:
+    """Return the radiograph P[F~] (row, column), grey levels, of the moved volume."""
+    blank = np.zeros(shape, dtype=np.float32)
+    return _walk(volume, rays, basis, amplitude, blank, blank, voxel_mm, step, False).residual
+
+
+def _walk(
+    volume: Volume,
+    rays: Floats,
+    basis: SectionBasis,
+    amplitude: Floats,
+    target: Image,
+    weight: Image,
+    voxel_mm: float,
+    step: float,
+    sensitivities: bool,
+) -> StepEquations:
+    """Prepare one step in index coordinates of the volume, walk its rays, and add the bands in order."""
+    grid = volume.grid
+    if amplitude.shape != basis.shape or not np.isfinite(amplitude).all():
+        raise ValueError(f"amplitude: expected finite {basis.shape}, got {amplitude.shape}")
+    origin = np.array(grid.origin_mm)
+    index_rays = rays / grid.voxel_mm
+    index_rays[:2] -= origin / grid.voxel_mm
+    heights = (basis.height_mm - origin[2]) / grid.voxel_mm
+    ratio = voxel_mm / grid.voxel_mm
+    maps = _indexed(basis.affine(amplitude), origin, grid.voxel_mm) * ratio
+    patterns = _indexed(basis.patterns(), origin, grid.voxel_mm) * ratio
+    slabs = _hull_in_index(volume)
+    box = _moved_box(volume, heights, maps)
+    low, span = _band_sections(index_rays, target.shape, heights, box)
+    bands = len(low)
+    size = span * basis.shape[1] if sensitivities else 0
+    matrices, vectors = np.zeros((bands, size, size)), np.zeros((bands, size))
+    chi2 = np.zeros(bands)
+    residual = np.empty(target.shape, dtype=np.float32)
+    _walk_bands(
+        volume.values.reshape(-1),
+        np.array(grid.shape, dtype=np.int64),
+        slabs[0],
+        slabs[1],
+        box,
+        index_rays,
+        heights,
+        maps,
+        np.ascontiguousarray(patterns.reshape(*basis.shape, 12)),
+        target,
+        weight,
+        step,
+        grid.voxel_mm,
+        sensitivities,
+        low,
+        matrices,
+        vectors,
+        chi2,
+        residual,
+    )
+    total = basis.shape[0] * basis.shape[1] if sensitivities else 0
+    matrix, vector = np.zeros((total, total)), np.zeros(total)
+    for band in range(bands if sensitivities else 0):
+        first = low[band] * basis.shape[1]
+        here = slice(first, min(first + size, total))
+        count = here.stop - here.start
+        matrix[here, here] += matrices[band, :count, :count]
+        vector[here] += vectors[band, :count]
+    matrix += np.tril(matrix, -1).T
+    return StepEquations(matrix=matrix, vector=vector, chi2=float(chi2.sum()), residual=residual)
+
+
+def _indexed(affine: Floats, origin_mm: Floats, voxel_mm: float) -> Floats:
+    """Turn affine maps (..., 3, 4) of x in mm into the same maps of voxel indices."""
+    result = affine.copy()
+    result[..., 3] += affine[..., :3] @ origin_mm
+    result[..., :3] *= voxel_mm
+    return result
+
+
+def _hull_in_index(volume: Volume) -> tuple[Floats, Floats]:
+    """Return (bottom, height) of the hull's slabs and its supports, in voxel indices."""
+    grid, hull = volume.grid, volume.hull
+    origin = np.array(grid.origin_mm)
+    place = np.array([(hull.z_mm - origin[2]) / grid.voxel_mm, hull.slab_mm / grid.voxel_mm])
+    support = (hull.support_mm - _NORMALS @ origin[:2]) / grid.voxel_mm
+    return place, support
+
+
+def _moved_box(volume: Volume, heights: Floats, maps: Floats) -> Floats:
+    """Return a box (2, 3), in voxel indices, that holds the hull wherever u takes it.
+
+    x = X + u(x): bounding u over the hull's box, enlarged once by that bound, bounds the moved hull.
+    """
+    low, high = volume.hull.box_mm()
+    origin = np.array(volume.grid.origin_mm)
+    box = np.array([low - origin, high - origin]) / volume.grid.voxel_mm
+    for _ in range(2):
+        corners = np.array(np.meshgrid(*box.T, indexing="ij")).reshape(3, -1).T
+        ends = np.concatenate(
+            [np.column_stack([corners[:, :2], np.full(len(corners), z)]) for z in (*heights, *box[:, 2])]
+        )
+        moved = np.einsum("jab,pb->jpa", maps[..., :3], ends) + maps[..., None, :, 3]
+        reach_low, reach_high = moved.min(axis=(0, 1)), moved.max(axis=(0, 1))
+        start = np.array([low - origin, high - origin]) / volume.grid.voxel_mm
+        box = np.array([start[0] + np.minimum(reach_low, 0) - 1, start[1] + np.maximum(reach_high, 0) + 1])
+    return box
+
+
+def _band_sections(
+    rays: Floats, shape: tuple[int, ...], heights: Floats, box: Floats
+) -> tuple[NDArray[np.int64], int]:
+    """Return each band's lowest section, and the largest number of sections that any band touches."""
+    rows, columns = shape
+    bands = -(-rows // BAND_ROWS)
+    low, high = np.empty(bands, dtype=np.int64), np.empty(bands, dtype=np.int64)
+    middle = box.mean(axis=0)
+    reach = np.linalg.norm(box[1, :2] - box[0, :2]) / 2 + 1
+    for band in range(bands):
+        ends = (band * BAND_ROWS, min((band + 1) * BAND_ROWS, rows) - 1)
+        z = []
+        for row in ends:
+            for column in (0, columns - 1):
+                ray = rays[1] + row * rays[2] + column * rays[3] - rays[0]
+                length = np.hypot(ray[0], ray[1])
+                near = np.hypot(*(middle[:2] - rays[0, :2]))
+                # half a percent more: rays at the edges are longer than their distance to the axis
+                z += [rays[0, 2] + ray[2] / length * s for s in (0.995 * near - reach, 1.005 * near + reach)]
+        low[band] = max(np.searchsorted(heights, min(z) - 1, side="right") - 1, 0)
+        high[band] = min(np.searchsorted(heights, max(z) + 1, side="left"), len(heights) - 1)
+    high = np.maximum(high, low)
+    return low, int((high - low).max()) + 1
+
+
+@njit(nogil=True, cache=True, fastmath=True, boundscheck=False)
+def _sum_all(volume, stride_y, stride_z, limit, first, last, step, path):  # type: ignore[no-untyped-def]
+    """Sum F, and grad F times 1, l, l^2, at l = (m + 1/2) step, first <= m < last; path = x'(l)."""
+    ax, bx, cx, ay, by, cy, az, bz, cz = path
+    mx, my, mz = limit
+    s = v0 = g0 = g1 = g2 = h0 = h1 = h2 = k0 = k1 = k2 = _f(0)
+    one = np.uint32(1)
+    for m in range(first, last):
+        t = (_f(m) + _f(0.5)) * step
+        x = min(max(ax + t * (bx + t * cx), _f(0)), mx)
+        y = min(max(ay + t * (by + t * cy), _f(0)), my)
+        z = min(max(az + t * (bz + t * cz), _f(0)), mz)
+        ix, iy, iz = np.int32(x), np.int32(y), np.int32(z)
+        fx, fy, fz = x - _f(ix), y - _f(iy), z - _f(iz)
+        o = np.uint32(iz * stride_z + iy * stride_y + ix)
+        p = o + stride_z
+        a000, a001, a010, a011 = volume[o], volume[o + one], volume[o + stride_y], volume[o + stride_y + one]
+        a100, a101, a110, a111 = volume[p], volume[p + one], volume[p + stride_y], volume[p + stride_y + one]
+        d00, d01, d10, d11 = a001 - a000, a011 - a010, a101 - a100, a111 - a110
+        c00, c01, c10, c11 = a000 + fx * d00, a010 + fx * d01, a100 + fx * d10, a110 + fx * d11
+        e0, e1 = c01 - c00, c11 - c10
+        b0 = c00 + fy * e0
+        gz = c10 + fy * e1 - b0
+        gy = e0 + fz * (e1 - e0)
+        x0 = d00 + fy * (d01 - d00)
+        gx = x0 + fz * (d10 + fy * (d11 - d10) - x0)
+        v0 += b0 + fz * gz
+        g0 += gx
+        g1 += gy
+        g2 += gz
+        s = t * gx
+        h0 += s
+        k0 += t * s
+        s = t * gy
+        h1 += s
+        k1 += t * s
+        s = t * gz
+        h2 += s
+        k2 += t * s
+    return v0, g0, g1, g2, h0, h1, h2, k0, k1, k2
+
+
+@njit(nogil=True, cache=True, fastmath=True, boundscheck=False)
+def _sum_values(volume, stride_y, stride_z, limit, first, last, step, path):  # type: ignore[no-untyped-def]
+    """Sum F at l = (m + 1/2) step, first <= m < last; path = x'(l)."""
+    ax, bx, cx, ay, by, cy, az, bz, cz = path
+    mx, my, mz = limit
+    v0 = _f(0)
+    one = np.uint32(1)
+    for m in range(first, last):
+        t = (_f(m) + _f(0.5)) * step
+        x = min(max(ax + t * (bx + t * cx), _f(0)), mx)
+        y = min(max(ay + t * (by + t * cy), _f(0)), my)
+        z = min(max(az + t * (bz + t * cz), _f(0)), mz)
+        ix, iy, iz = np.int32(x), np.int32(y), np.int32(z)
+        fx, fy, fz = x - _f(ix), y - _f(iy), z - _f(iz)
+        o = np.uint32(iz * stride_z + iy * stride_y + ix)
+        p = o + stride_z
+        a000, a001, a010, a011 = volume[o], volume[o + one], volume[o + stride_y], volume[o + stride_y + one]
+        a100, a101, a110, a111 = volume[p], volume[p + one], volume[p + stride_y], volume[p + stride_y + one]
+        c00, c01 = a000 + fx * (a001 - a000), a010 + fx * (a011 - a010)
+        c10, c11 = a100 + fx * (a101 - a100), a110 + fx * (a111 - a110)
+        b0 = c00 + fy * (c01 - c00)
+        v0 += b0 + fz * (c10 + fy * (c11 - c10) - b0)
+    return v0
+
+
+@njit(nogil=True, cache=True)
+def _clip_box(box, base, along):  # type: ignore[no-untyped-def]
+    """Return the part [a, b] of the ray base + l along that lies in a box; empty where a >= b."""
+    a, b = -_BIG, _BIG
+    for i in range(3):
+        if abs(along[i]) < 1e-12:
+            if base[i] < box[0, i] or base[i] > box[1, i]:
+                return 0.0, 0.0
+        else:
+            near, far = (box[0, i] - base[i]) / along[i], (box[1, i] - base[i]) / along[i]
+            a, b = max(a, min(near, far)), min(b, max(near, far))
+    return a, b
+
+
+@njit(nogil=True, cache=True)
+def _clip_hull(place, support, normals, a, b, path):  # type: ignore[no-untyped-def]
+    """Shrink [a, b] to where the moved ray x'(l), taken as straight between a and b, meets the hull."""
+    ax, bx, cx, ay, by, cy, az, bz, cz = path
+    xa, ya, za = ax + a * (bx + a * cx), ay + a * (by + a * cy), az + a * (bz + a * cz)
+    xb, yb, zb = ax + b * (bx + b * cx), ay + b * (by + b * cy), az + b * (bz + b * cz)
+    first = max(int(np.floor((min(za, zb) - place[0]) / place[1])), 0)
+    last = min(int(np.floor((max(za, zb) - place[0]) / place[1])), support.shape[0] - 1)
+    low, high = 0.0, 1.0
+    for k in range(normals.shape[0]):
+        limit = -np.inf
+        for slab in range(first, last + 1):
+            limit = max(limit, support[slab, k])
+        if limit == -np.inf:
+            return a, a
+        da = limit - (normals[k, 0] * xa + normals[k, 1] * ya)
+        db = limit - (normals[k, 0] * xb + normals[k, 1] * yb)
+        if da < 0 and db < 0:
+            return a, a
+        if da < 0:
+            low = max(low, da / (da - db))
+        elif db < 0:
+            high = min(high, da / (da - db))
+    return a + low * (b - a), a + high * (b - a)
+
+
+@njit(nogil=True, cache=True)
+def _quadratic(first, second, base, along, s0, s1):  # type: ignore[no-untyped-def]
+    """Return the coefficients of x'(l) = x - u(x), with u = (1 - s) u_first + s u_second, s = s0 + s1 l."""
+    c = np.empty((3, 3))
+    for i in range(3):
+        p = first[i, 0] * base[0] + first[i, 1] * base[1] + first[i, 2] * base[2] + first[i, 3]
+        q = first[i, 0] * along[0] + first[i, 1] * along[1] + first[i, 2] * along[2]
+        dp = second[i, 0] * base[0] + second[i, 1] * base[1] + second[i, 2] * base[2] + second[i, 3] - p
+        dq = second[i, 0] * along[0] + second[i, 1] * along[1] + second[i, 2] * along[2] - q
+        c[i, 0] = base[i] - p - s0 * dp
+        c[i, 1] = along[i] - q - s0 * dq - s1 * dp
+        c[i, 2] = -s1 * dq
+    return (c[0, 0], c[0, 1], c[0, 2], c[1, 0], c[1, 1], c[1, 2], c[2, 0], c[2, 1], c[2, 2])
+
+
+@njit(nogil=True, cache=True)
+def _add_section(pattern, w0, w1, base, along, sums, scale, out):  # type: ignore[no-untyped-def]
+    """Add to `out` (motion,) the integral of (w0 + w1 l) Psi(x(l)) . grad F, from the nine sums."""
+    k = np.empty(12)
+    for i in range(3):
+        m0, m1, m2 = sums[1 + i], sums[4 + i], sums[7 + i]
+        flat, tilted = (w0 * m0 + w1 * m1) * scale, (w0 * m1 + w1 * m2) * scale
+        for j in range(3):
+            k[4 * i + j] = flat * base[j] + tilted * along[j]
+        k[4 * i + 3] = flat
+    for n in range(pattern.shape[0]):
+        total = 0.0
+        for i in range(12):
+            total += pattern[n, i] * k[i]
+        out[n] += total
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+def _add_outer(matrix, vector, s, first, last, weight, rho):  # type: ignore[no-untyped-def]
+    """Add w s s^T (lower triangle) and w s rho of one pixel."""
+    for i in range(first, last):
+        w = weight * s[i]
+        vector[i] += w * rho
+        for j in range(first, i + 1):
+            matrix[i, j] += w * s[j]
+
+
+@njit(nogil=True, cache=True, parallel=True)
+def _walk_bands(  # type: ignore[no-untyped-def]
+    volume,
+    shape,
+    place,
+    support,
+    box,
+    rays,
+    heights,
+    maps,
+    patterns,
+    target,
+    weight,
+    step,
+    voxel_mm,
+    sensitivities,
+    low,
+    matrices,
+    vectors,
+    chi2,
+    residual,
+):
+    """Walk all rays of a window, band by band."""
+    for band in prange(len(low)):
+        _walk_band(
+            volume,
+            shape,
+            place,
+            support,
+            box,
+            rays,
+            heights,
+            maps,
+            patterns,
+            target,
+            weight,
+            step,
+            voxel_mm,
+            sensitivities,
+            low[band],
+            band,
+            matrices[band],
+            vectors[band],
+            chi2,
+            residual,
+        )
+
+
+@njit(nogil=True, cache=True)
+def _walk_band(  # type: ignore[no-untyped-def]
+    volume,
+    shape,
+    place,
+    support,
+    box,
+    rays,
+    heights,
+    maps,
+    patterns,
+    target,
+    weight,
+    step,
+    voxel_mm,
+    sensitivities,
+    low,
+    band,
+    matrix,
+    vector,
+    chi2,
+    residual,
+):
+    """Walk the rays of one band of rows."""
+    rows, columns = target.shape
+    n, motions = patterns.shape[0], patterns.shape[1]
+    stride_y, stride_z = np.uint32(shape[2]), np.uint32(shape[2] * shape[1])
+    limit = (_f(shape[2] - 1.0001), _f(shape[1] - 1.0001), _f(shape[0] - 1.0001))
+    step32 = _f(step)
+    scale = step * voxel_mm
+    normals = _NORMALS
+    s = np.zeros(max(vector.shape[0], 1))
+    base, along = np.empty(3), np.empty(3)
+    middle = 0.5 * (box[0] + box[1])
+    for row in range(band * BAND_ROWS, min((band + 1) * BAND_ROWS, rows)):
+        for column in range(columns):
+            length, reach = 0.0, 0.0
+            for i in range(3):
+                along[i] = rays[1, i] + row * rays[2, i] + column * rays[3, i] - rays[0, i]
+                length += along[i] * along[i]
+            for i in range(3):
+                along[i] /= np.sqrt(length)
+                reach += along[i] * (middle[i] - rays[0, i])
+            for i in range(3):
+                # l = 0 where the ray passes the middle of the sample, so that single precision is enough
+                base[i] = rays[0, i] + reach * along[i]
+            value = 0.0
+            a, end = _clip_box(box, base, along)
+            k_first, k_last = n, -1
+            rising = along[2] >= 0
+            while a < end:
+                # the interval between sections k and k + 1 that the ray enters at a
+                z = base[2] + a * along[2]
+                k = -1
+                while k + 1 < n and (heights[k + 1] < z or (rising and heights[k + 1] == z)):
+                    k += 1
+                b = end
+                wall = k + 1 if rising else k
+                if n > 1 and 0 <= wall < n and abs(along[2]) > 1e-9:
+                    b = min(end, (heights[wall] - base[2]) / along[2])
+                    if b <= a:  # rounding left the ray on the wall: step over it
+                        b = min(end, a + 1e-7)
+                j0, j1, s0, s1 = max(k, 0), min(max(k, 0) + 1, n - 1), 0.0, 0.0
+                if 0 <= k < n - 1:
+                    s1 = along[2] / (heights[k + 1] - heights[k])
+                    s0 = (base[2] - heights[k]) / (heights[k + 1] - heights[k])
+                else:
+                    j1 = j0
+                path = _quadratic(maps[j0], maps[j1], base, along, s0, s1)
+                inner_a, inner_b = _clip_hull(place, support, normals, a, b, path)
+                if inner_a < inner_b:
+                    # points m + 1/2 are shared out so that each belongs to one interval
+                    first = int(np.ceil(inner_a / step - 0.5))
+                    last = int(np.ceil(inner_b / step - 0.5))
+                    if last > first:
+                        path32 = (
+                            _f(path[0]),
+                            _f(path[1]),
+                            _f(path[2]),
+                            _f(path[3]),
+                            _f(path[4]),
+                            _f(path[5]),
+                            _f(path[6]),
+                            _f(path[7]),
+                            _f(path[8]),
+                        )
+                        if sensitivities:
+                            sums = _sum_all(volume, stride_y, stride_z, limit, first, last, step32, path32)
+                            value += sums[0]
+                            if k_last < 0:
+                                k_first, k_last = j0, j1
+                            k_first, k_last = min(k_first, j0), max(k_last, j1)
+                            if j0 == j1:
+                                at = (j0 - low) * motions
+                                _add_section(patterns[j0], 1.0, 0.0, base, along, sums, scale, s[at : at + motions])
+                            else:
+                                at = (j0 - low) * motions
+                                _add_section(
+                                    patterns[j0],
+                                    1.0 - s0,
+                                    -s1,
+                                    base,
+                                    along,
+                                    sums,
+                                    scale,
+                                    s[at : at + motions],
+                                )
+                                at = (j1 - low) * motions
+                                _add_section(patterns[j1], s0, s1, base, along, sums, scale, s[at : at + motions])
+                        else:
+                            value += _sum_values(volume, stride_y, stride_z, limit, first, last, step32, path32)
+                a = b
+            rho = value * scale - target[row, column]
+            residual[row, column] = rho
+            w = weight[row, column]
+            chi2[band] += w * rho * rho
+            if k_last >= 0:
+                first, last = (k_first - low) * motions, (k_last + 1 - low) * motions
+                if w > 0:
+                    _add_outer(matrix, vector, s, first, last, w, rho)
+                s[first:last] = 0.0

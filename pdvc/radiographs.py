@@ -1,0 +1,139 @@
+"""Counts to grey levels: dark, flat, bad pixels, logarithm, beam hardening, normalisation, coarse scales.
+
+    q = -log((I - D) / (I0 - D))                   attenuation, without unit
+    g = c1 q + c2 q^2 + c3 q^3                     grey level: 0 in air, 1 at the largest attenuation
+
+with I the counts, D the mean dark and I0 the mean flat. The noise of I follows Poisson's law and the readout:
+
+    var I = ((I - D) / photons_per_count + readout^2) / frames
+    var g = (dg/dq)^2 (var I / (I - D)^2 + var I0 / (I0 - D)^2)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pdvc.experiment import Experiment
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+IDENTITY = (1.0, 0.0, 0.0)
+"""The polynomial that leaves attenuation as it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """Hold what turns the counts of one detector into grey levels."""
+
+    dark: Image
+    """Mean dark (row, column), counts."""
+    open_beam: Image
+    """Mean flat less dark (row, column), counts."""
+    bad: NDArray[np.bool_]
+    """(row, column) pixels that are not to be believed."""
+    polynomial: tuple[float, float, float] = IDENTITY
+    """c1, c2, c3: from attenuation to grey levels."""
+
+    def with_polynomial(self, polynomial: tuple[float, float, float]) -> Calibration:
+        """Return the calibration with another polynomial."""
+        return replace(self, polynomial=polynomial)
+
+
+def calibrate(experiment: Experiment) -> Calibration:
+    """Average flats and darks, and find the bad pixels in them.
+
+    A pixel is bad where its open beam is under a tenth of the median, or where flat or dark stands out of its
+    3 x 3 neighbourhood by more than eight times the usual deviation. Raises ValueError where the flats
+    are not brighter than the darks.
+    """
+    dark: Floats = np.asarray(np.mean(experiment.darks, axis=0, dtype=np.float64))
+    flat: Floats = np.asarray(np.mean(experiment.flats, axis=0, dtype=np.float64))
+    open_beam = np.asarray(flat - dark)
+    level = float(np.median(open_beam))
+    if level <= 0:
+        raise ValueError(f"flats: expected more counts than the darks, found a median difference of {level:.0f}")
+    bad = (open_beam < 0.1 * level) | _stands_out(flat) | _stands_out(dark)
+    return Calibration(
+        dark=np.asarray(dark, dtype=np.float32),
+        open_beam=np.where(bad, level, open_beam).astype(np.float32),
+        bad=bad,
+    )
+
+
+def _stands_out(image: Floats) -> NDArray[np.bool_]:
+    deviation = np.abs(image - ndimage.median_filter(image, size=3))
+    return np.asarray(deviation > 8 * 1.4826 * max(float(np.median(deviation)), 0.5))
+
+
+def grey_levels(counts: NDArray[np.uint16], calibration: Calibration) -> Image:
+    """Turn one radiograph (row, column) of counts into grey levels; bad pixels take their neighbours' mean."""
+    signal = np.maximum(counts.astype(np.float32) - calibration.dark, np.float32(1))
+    attenuation = np.log(calibration.open_beam / signal)
+    c1, c2, c3 = (np.float32(c) for c in calibration.polynomial)
+    grey = attenuation * (c1 + attenuation * (c2 + attenuation * c3))
+    return np.asarray(fill(grey, calibration.bad), dtype=np.float32)
+
+
+def grey_variance(
+    counts: NDArray[np.uint16],
+    calibration: Calibration,
+    *,
+    photons_per_count: float,
+    readout_noise_counts: float,
+    frames: int,
+    flats: int,
+) -> Image:
+    """Return the variance of each grey level (row, column) from photon and readout noise."""
+    signal = np.maximum(counts.astype(np.float32) - calibration.dark, np.float32(1))
+    c1, c2, c3 = calibration.polynomial
+    attenuation = np.log(calibration.open_beam / signal)
+    slope = c1 + attenuation * (2 * c2 + 3 * c3 * attenuation)
+    total = np.zeros_like(signal)
+    for level, images in ((signal, frames), (calibration.open_beam, frames * flats)):
+        total += (level / photons_per_count + readout_noise_counts**2) / (images * level**2)
+    return np.asarray(slope**2 * total, dtype=np.float32)
+
+
+def fill(image: Image, bad: NDArray[np.bool_]) -> Image:
+    """Replace bad pixels by the mean of the good pixels in the smallest square around them that has any."""
+    result = image.copy()
+    rows, columns = image.shape
+    for row, column in np.argwhere(bad):
+        for reach in range(1, max(rows, columns)):
+            window = (
+                slice(max(row - reach, 0), row + reach + 1),
+                slice(max(column - reach, 0), column + reach + 1),
+            )
+            good = ~bad[window]
+            if good.any():
+                result[row, column] = image[window][good].mean()
+                break
+    return result
+
+
+def coarsened(image: Image, factor: int) -> Image:
+    """Filter with a Gaussian as wide as the new pixels (sigma = factor / 2), then average factor x factor.
+
+    The paper's way to scale 2 (section 4.1); incomplete blocks at the bottom and right are dropped,
+    as in ConeBeam.binned.
+    """
+    if factor == 1:
+        return image
+    return binned(ndimage.gaussian_filter(image, factor / 2, mode="nearest", truncate=3), factor)
+
+
+def binned(image: Image, factor: int) -> Image:
+    """Average blocks of factor x factor pixels."""
+    rows, columns = image.shape[0] // factor, image.shape[1] // factor
+    blocks = image[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
+    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float32)
+
+
+def snr_db(signal: Image, residual: Image, used: NDArray[np.bool_]) -> float:
+    """Return 20 log10(std(signal) / std(residual)) over the used pixels, dB."""
+    return float(20 * np.log10(np.std(signal[used], dtype=float) / np.std(residual[used], dtype=float)))

@@ -1,0 +1,222 @@
+"""The reference volume by filtered back-projection of cone-beam views (Feldkamp, Davis and Kress, 1984).
+
+For a full turn of views at angles theta_i, in the frame of pdvc.geometry, with R the source-axis distance and
+detector coordinates (u, v) scaled to the axis plane (u along e_c, v downwards, mm):
+
+    p'(u, v)  = p(u, v) R / sqrt(R^2 + u^2 + v^2)                     cosine weight
+    q         = p' * h along u,   h the band-limited ramp             1 / mm
+    F(x)      = 1/2 sum_i dtheta_i (R / U)^2 q_i(u(x), v(x)),         U = R + x . e_b(theta_i)
+    u(x)      = R (x . e_c) / U,   v(x) = -R z / U
+
+Only voxels inside a hull are reconstructed; views are read, filtered and used in batches, never all at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from pdvc.geometry import ConeBeam
+from pdvc.progress import Progress, silent
+from pdvc.rays import directions
+from pdvc.volume import Grid, Hull
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+BATCH = 12
+"""Views that are back-projected together."""
+LARGEST_GAP_RAD = np.deg2rad(20.0)
+
+
+def fdk(
+    view: Callable[[int], Image],
+    geometry: ConeBeam,
+    angle_rad: Floats,
+    grid: Grid,
+    hull: Hull,
+    *,
+    progress: Progress = silent,
+    task: str = "reconstruct",
+) -> NDArray[np.float32]:
+    """Reconstruct F on a grid (z, y, x), grey levels per mm, zero outside the hull and in the outermost layer.
+
+    `view(i)` returns radiograph i (row, column) in grey levels. Raises ValueError where the angles do
+    not go all around.
+    """
+    share = angular_share(angle_rad)
+    level = replace(geometry, roll_rad=0.0)
+    inside, first = _columns_inside(grid, hull)
+    result = np.zeros((grid.shape[1], grid.shape[2], grid.shape[0]), dtype=np.float32)
+    weight, ramp = _cosine_weight(level), _ramp(level)
+    beam, across = directions(angle_rad)
+    for start in range(0, len(angle_rad), BATCH):
+        batch = range(start, min(start + BATCH, len(angle_rad)))
+        filtered = np.stack([_filtered(_unrolled(view(i), geometry) * weight * share[i], ramp) for i in batch])
+        _back_project(
+            result,
+            np.ascontiguousarray(filtered.transpose(0, 2, 1)),
+            beam[batch.start : batch.stop],
+            across[batch.start : batch.stop],
+            np.array(grid.origin_mm),
+            grid.voxel_mm,
+            np.array([level.source_axis_mm, level.source_detector_mm, level.pixel_mm]),
+            np.array([level.column_shift_mm, level.row_shift_mm]),
+            inside,
+            first,
+        )
+        progress(task, batch.stop, len(angle_rad))
+    return _framed(np.ascontiguousarray(result.transpose(2, 0, 1)))
+
+
+def angular_share(angle_rad: Floats) -> Floats:
+    """Return dtheta_i / 2: half the turn that each view stands for, from the gaps to its neighbours.
+
+    Views at the same angle share its part. Raises ValueError where a gap exceeds 20 degrees.
+    """
+    turned = np.mod(angle_rad, 2 * np.pi)
+    unique, inverse, count = np.unique(np.round(turned, 9), return_inverse=True, return_counts=True)
+    gaps = np.diff(np.append(unique, unique[0] + 2 * np.pi))
+    if len(unique) < 3 or gaps.max() > LARGEST_GAP_RAD:
+        raise ValueError(
+            f"reference angles: expected a full turn without gaps above {np.rad2deg(LARGEST_GAP_RAD):.0f} degrees, "
+            f"found one of {np.rad2deg(gaps.max()):.1f} degrees"
+        )
+    part = (gaps + np.roll(gaps, 1)) / 2 / count
+    return np.asarray(part[inverse] / 2)
+
+
+def seen_half_height_mm(geometry: ConeBeam, radius_mm: float) -> float:
+    """Return the height up to which every view sees all of a cylinder of this radius, mm."""
+    half = (geometry.rows / 2 - 0.5) * geometry.pixel_mm - abs(geometry.row_shift_mm)
+    return half * (geometry.source_axis_mm - radius_mm) / geometry.source_detector_mm
+
+
+def _cosine_weight(geometry: ConeBeam) -> Image:
+    row = (np.arange(geometry.rows) - (geometry.rows - 1) / 2) * geometry.pixel_mm + geometry.row_shift_mm
+    column = (np.arange(geometry.columns) - (geometry.columns - 1) / 2) * geometry.pixel_mm
+    column += geometry.column_shift_mm
+    distance = geometry.source_detector_mm
+    weight = distance / np.sqrt(distance**2 + row[:, None] ** 2 + column[None] ** 2)
+    return np.asarray(weight, dtype=np.float32)
+
+
+def _ramp(geometry: ConeBeam) -> NDArray[np.complex64]:
+    """Return the transform of the band-limited ramp, sampled in space (Kak and Slaney, 1988, Eq. 3.61)."""
+    length = fft.next_fast_len(2 * geometry.columns, real=True)
+    n = np.minimum(np.arange(length), length - np.arange(length))
+    kernel = np.zeros(length)
+    kernel[0] = 0.25
+    odd = n % 2 == 1
+    kernel[odd] = -1 / (np.pi * n[odd]) ** 2
+    return np.asarray(fft.rfft(kernel / geometry.voxel_mm), dtype=np.complex64)
+
+
+def _filtered(image: Image, ramp: NDArray[np.complex64]) -> Image:
+    columns = image.shape[1]
+    length = 2 * (len(ramp) - 1) if len(ramp) * 2 - 2 >= 2 * columns else 2 * len(ramp) - 1
+    spectrum = fft.rfft(image, n=length, axis=1) * ramp
+    return np.asarray(fft.irfft(spectrum, n=length, axis=1)[:, :columns], dtype=np.float32)
+
+
+def _unrolled(image: Image, geometry: ConeBeam) -> Image:
+    """Turn a radiograph about the detector's centre, as a detector without roll would have seen it."""
+    if geometry.roll_rad == 0:
+        return image
+    c, s = np.cos(geometry.roll_rad), np.sin(geometry.roll_rad)
+    turn = np.array([[c, -s], [s, c]])  # (row, column) on the rolled detector of a level one's offset
+    centre = (np.array(image.shape) - 1) / 2
+    return np.asarray(
+        ndimage.affine_transform(image, turn, centre - turn @ centre, order=1, mode="nearest"),
+        dtype=np.float32,
+    )
+
+
+def _columns_inside(grid: Grid, hull: Hull) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return which slabs (y, x, slab) hold a column of voxels, and each slab's first voxel (slab + 1,)."""
+    x = grid.origin_mm[0] + grid.voxel_mm * np.arange(grid.shape[2])
+    y = grid.origin_mm[1] + grid.voxel_mm * np.arange(grid.shape[1])
+    edges = hull.z_mm + hull.slab_mm * np.arange(len(hull.support_mm) + 1)
+    first = np.clip(np.ceil((edges - grid.origin_mm[2]) / grid.voxel_mm), 0, grid.shape[0]).astype(np.int64)
+    inside = np.ones((len(y), len(x), len(hull.support_mm)), dtype=bool)
+    for k, (nx, ny) in enumerate(Hull.normals()):
+        inside &= (nx * x[None, :] + ny * y[:, None])[..., None] <= hull.support_mm[:, k]
+    return inside, first
+
+
+@njit(nogil=True, cache=True, fastmath=True, boundscheck=False)
+def _blend(one, two, f, first, last, out):  # type: ignore[no-untyped-def]
+    for r in range(first, last):
+        out[r] = one[r] + f * (two[r] - one[r])
+
+
+@njit(nogil=True, cache=True, fastmath=True, boundscheck=False)
+def _add_slab(out, line, first, last, r0, dr, top, weight):  # type: ignore[no-untyped-def]
+    for k in range(first, last):
+        r = min(max(r0 + np.float32(k) * dr, np.float32(0)), top)
+        i = np.uint32(r)
+        low = line[i]
+        out[k] += weight * (low + (r - np.float32(i)) * (line[i + np.uint32(1)] - low))
+
+
+@njit(nogil=True, cache=True, parallel=True)
+def _back_project(out, views, beam, across, origin, voxel, distances, shift, inside, first):  # type: ignore[no-untyped-def]
+    """Add a batch of filtered views (view, column, row) to the volume (y, x, z)."""
+    ny, nx = out.shape[:2]
+    columns, rows = views.shape[1], views.shape[2]
+    source, detector, pixel = distances
+    for j in prange(ny):
+        line = np.empty(rows, np.float32)
+        for i in range(nx):
+            low, high = -1, -1
+            for slab in range(inside.shape[2]):
+                if inside[j, i, slab] and first[slab + 1] > first[slab]:
+                    if low < 0:
+                        low = first[slab]
+                    high = first[slab + 1]
+            if low < 0:
+                continue
+            x, y = origin[0] + voxel * i, origin[1] + voxel * j
+            for n in range(views.shape[0]):
+                depth = source + x * beam[n, 0] + y * beam[n, 1]
+                scale = detector / (depth * pixel)
+                u = (x * across[n, 0] + y * across[n, 1]) * scale - shift[0] / pixel + 0.5 * (columns - 1)
+                if u < 0 or u >= columns - 1:
+                    continue
+                c = int(u)
+                r0 = -origin[2] * scale - shift[1] / pixel + 0.5 * (rows - 1)
+                dr = -voxel * scale
+                r_from = max(int(r0 + dr * (high - 1)) - 1, 0)
+                r_to = min(int(max(r0 + dr * low, 0.0)) + 3, rows)
+                if r_from >= r_to:
+                    continue
+                if r0 + dr * low < 0 or r0 + dr * (high - 1) > rows - 1:
+                    r_from, r_to = 0, rows
+                _blend(views[n, c], views[n, c + 1], np.float32(u - c), r_from, r_to, line)
+                weight = np.float32((source / depth) ** 2)
+                for slab in range(inside.shape[2]):
+                    if inside[j, i, slab]:
+                        _add_slab(
+                            out[j, i],
+                            line,
+                            first[slab],
+                            first[slab + 1],
+                            np.float32(r0),
+                            np.float32(dr),
+                            np.float32(rows - 1.001),
+                            weight,
+                        )
+
+
+def _framed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Set the outermost layer of voxels to zero, so that interpolation at the hull ends in air."""
+    for axis in range(3):
+        face = np.moveaxis(values, axis, 0)
+        face[0] = 0
+        face[-1] = 0
+    return values

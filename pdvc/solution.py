@@ -1,0 +1,53 @@
+"""What a solver returns, and the careful step that solvers share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.equations import Equations, Linearise
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solution:
+    """Hold what a solver found: the motion, how it got there, and why it stopped."""
+
+    coefficients: Floats
+    """u_ij: amplitudes (function, section, motion), voxels, the start included."""
+    equations: Equations
+    """The equations at the solution."""
+    temporal: Floats
+    """alpha (mode, step) of each mode; (0, step) for a solver without modes."""
+    spatial: Floats
+    """b (mode, section, motion), voxels."""
+    rms: Floats
+    """Rms residual (pass,), grey levels: before the first mode and after each."""
+    stop_reason: str
+
+
+def evaluated(linearise: Linearise, time_functions: Floats, shape: tuple[int, ...]) -> Callable[[Floats], Equations]:
+    """Return the equations as a function of coefficients (function, section * motion).
+
+    `shape` is (function, section, motion).
+    """
+
+    def at(coefficients: Floats) -> Equations:
+        return linearise(np.einsum("ft,fn->tn", time_functions, coefficients).reshape(-1, *shape[1:]))
+
+    return at
+
+
+def shortened(
+    at: Callable[[Floats], Equations], coefficients: Floats, change: Floats, now: Equations
+) -> tuple[float, Equations | None]:
+    """Try the whole change, a half and a quarter; return the first that lowers the residual, else None."""
+    for step in (1.0, 0.5, 0.25):
+        trial = at(coefficients + step * change)
+        if trial.rms < now.rms:
+            return step, trial
+    return 0.0, None
