@@ -208,7 +208,7 @@ class StackWriter:
             with tifffile.TiffWriter(self._partial, bigtiff=_too_large(shape)) as tiff:
                 blank = np.zeros(shape[1:], dtype=np.uint16)
                 tiff.write((blank for _ in range(shape[0])), shape=shape, dtype=np.uint16, photometric="minisblack")
-        self._map = None if self.done == shape[0] else tifffile.memmap(self._partial, mode="r+").reshape(shape)
+        self._map: Any = _open_map(self._partial, shape) if self.done < shape[0] else None
 
     def write(self, index: int, image: NDArray[np.uint16]) -> None:
         """Store the next image, counts (row, column); images come in order."""
