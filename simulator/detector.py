@@ -152,14 +152,15 @@ def pixel_means(image: NDArray[np.float32], subpixels: int, blur_px: float) -> N
     """Blur an image by a Gaussian and take the mean over each pixel, in one separable pass.
 
     The kernel is the Gaussian, sampled at sub-pixels to 5 deviations and of sum 1, convolved with the pixel's
-    box; beyond its edges the image goes on with its edge values. From (rows, columns) x subpixels to
-    (rows, columns).
+    box; beyond its edges the image goes on with its edge values. A deviation below half a sub-pixel is blurred
+    too little: take more sub-pixels. From (rows, columns) x subpixels to (rows, columns).
     """
     if image.shape[0] % subpixels or image.shape[1] % subpixels:
         raise ValueError(f"image: expected whole pixels of {subpixels} x {subpixels}, got shape {image.shape}")
     sigma = blur_px * subpixels
-    reach = math.ceil(5 * sigma)
-    gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2) if sigma > 0 else np.ones(1)
+    # below a twentieth of a sub-pixel the neighbours' weight is less than 1e-80
+    reach = math.ceil(5 * sigma) if sigma > 0.05 else 0
+    gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2) if reach else np.ones(1)
     kernel = np.convolve(gauss / gauss.sum(), np.full(subpixels, 1 / subpixels)).astype(np.float32)
     across = _down_columns(np.ascontiguousarray(image), kernel, subpixels, reach)
     return _down_rows(across, kernel, subpixels, reach)

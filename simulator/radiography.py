@@ -78,7 +78,9 @@ def path_lengths(
         points[:, 0] += geometry.source_axis_mm
         _check_depth(points[:, 0], geometry, angle_rad)
     surface = np.zeros((fine.rows, fine.columns))
-    _add_surface(surface, *fine.image_of(vertices), 1 / vertices[:, 0], np.ascontiguousarray(body.faces))
+    _add_surface(
+        surface, *fine.image_of(vertices), 1 / vertices[:, 0], np.ascontiguousarray(body.faces, dtype=np.int64)
+    )
     graphite = np.zeros((fine.rows, fine.columns), dtype=np.float32)
     shapes = _to_lab(body.shapes_mm.swapaxes(1, 2), angle_rad)
     _add_nodules(graphite, centres, shapes, *fine.image_of(centres), *fine.rays())

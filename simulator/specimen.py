@@ -50,15 +50,22 @@ class Specimen(Settings):
         for side, name in (("x", "width_mm"), ("y", "thickness_mm")):
             if self.thinned in (side, "both") and self.grip_width_mm < getattr(self, name):
                 raise ValueError(
-                    f"grip_width_mm of at least {name} = {getattr(self, name)} mm, "
-                    f"got {self.grip_width_mm} mm"
+                    f"grip_width_mm of at least {name} = {getattr(self, name)} mm, got {self.grip_width_mm} mm"
                 )
-        if self.facet_error_mm > 1e-4:
+            if self.thinned in (side, "both") and self._sag_mm(name) > self.fillet_radius_mm:
+                raise ValueError(
+                    f"fillet_radius_mm of at least {self._sag_mm(name):.6g} mm, to reach from {name} to "
+                    f"grip_width_mm, got {self.fillet_radius_mm} mm"
+                )
+        if self.facet_error_mm > 1e-4 * (1 + 1e-9):
             raise ValueError(
                 "facets within 1e-4 mm of the fillet: facet_mm of at most "
                 f"{np.sqrt(8e-4 * self.fillet_radius_mm):.3g} mm, got {self.facet_mm} mm"
             )
         return self
+
+    def _sag_mm(self, name: str) -> float:
+        return (self.grip_width_mm - float(getattr(self, name))) / 2
 
     @property
     def facet_error_mm(self) -> float:
@@ -156,8 +163,7 @@ def _levels(specimen: Specimen) -> NDArray[np.float64]:
     ends = {half}
     for side, flat in (("x", specimen.width_mm), ("y", specimen.thickness_mm)):
         if specimen.thinned in (side, "both"):
-            sag = (specimen.grip_width_mm - flat) / 2
-            end = np.sqrt(radius**2 - (radius - sag) ** 2) if sag < radius else radius
+            end = np.sqrt(radius**2 - (radius - (specimen.grip_width_mm - flat) / 2) ** 2)
             if specimen.facet_mm / 10 < end < half - specimen.facet_mm / 10:
                 ends.add(float(end))
     knots = [0.0, *sorted(ends)]
