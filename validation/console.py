@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Self
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from validation.scores import Scores
@@ -26,12 +34,14 @@ FAILED = 1
 
 
 class ProgressBars:
-    """Draw a bar with the remaining time for each task; a line at its end where there is no terminal."""
+    """Draw a bar with the remaining time for each task; a line at its end where there is no terminal.
+
+    Tasks that share what stands before a comma, as "rigid, pass 3" does, share a bar.
+    """
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._started: dict[str, float] = {}
-        self._tasks: dict[str, object] = {}
         self._bars = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=30),
@@ -43,6 +53,8 @@ class ProgressBars:
             speed_estimate_period=120,
             disable=not console.is_terminal,
         )
+        self._rows: dict[str, TaskID] = {}
+        self._shown: dict[str, str] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -54,14 +66,22 @@ class ProgressBars:
 
     def __call__(self, task: str, done: int, total: int) -> None:
         """Draw that `done` of `total` parts of `task` are finished."""
-        if task not in self._tasks:
-            self._bars.start()
-            self._started[task] = time.monotonic()
-            self._tasks[task] = self._bars.add_task(task, total=total, completed=done)
-        self._bars.update(self._tasks[task], completed=done, total=total)  # type: ignore[arg-type]
-        if done >= total and not self._console.is_terminal and task in self._started:
+        self._started.setdefault(task, time.monotonic())
+        if self._console.is_terminal:
+            self._draw(task, done, total)
+        elif done >= total:
             seconds = time.monotonic() - self._started.pop(task)
             self._console.print(f"{task}: {total} of {total} in {seconds:.1f} s", highlight=False)
+
+    def _draw(self, task: str, done: int, total: int) -> None:
+        group = task.partition(",")[0]
+        if group not in self._rows:
+            self._bars.start()
+            self._rows[group] = self._bars.add_task(task, total=total, completed=done)
+        elif self._shown[group] != task:
+            self._bars.reset(self._rows[group], total=total, completed=done, description=task)
+        self._shown[group] = task
+        self._bars.update(self._rows[group], completed=done, total=total)
 
 
 @contextmanager

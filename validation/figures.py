@@ -60,8 +60,10 @@ def draw_force(time_s: ArrayLike, force_N: ArrayLike, selected: Sequence[int], a
     time, force = np.asarray(time_s), np.asarray(force_N)
     ax.plot(time, force, color=BLUE, marker=".", markersize=3, linewidth=1)
     ax.plot(time[list(selected)], force[list(selected)], "o", color=VERMILION, label="steps shown above")
-    for step in selected:
-        ax.annotate(f"step {step}", (time[step], force[step]), xytext=(-8, 6), textcoords="offset points", ha="right")
+    for k, step in enumerate(selected):
+        # to either side in turn, because the last steps lie close together
+        side: dict[str, Any] = {"xytext": (-8, 6), "ha": "right"} if k % 2 == 0 else {"xytext": (8, -14), "ha": "left"}
+        ax.annotate(f"step {step}", (time[step], force[step]), textcoords="offset points", **side)
     ax.set(xlabel="time (s)", ylabel="force (N)")
     ax.margins(y=0.12)
     return _tidy(ax)

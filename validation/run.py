@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pdvc.experiment import DESCRIPTION, Experiment, ExperimentError, read_experiment
+from pdvc.experiment import DESCRIPTION, Experiment, read_experiment
 from pdvc.measurement import Measurement, read_measurement, write_measurement
 from pdvc.progress import Progress, silent
 from validation.report import write_report
@@ -62,8 +62,6 @@ class Job:
 class State:
     """Hold what earlier attempts did in a folder, so that the next one knows what still holds."""
 
-    scenario: str = ""
-    """Fingerprint of the scenario that is in experiment/, finished or not."""
     measurement: str = ""
     """Fingerprint of the experiment and options that measurement.nc belongs to."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -99,7 +97,7 @@ class Outcome:
 def run(job: Job, *, progress: Progress = silent) -> Outcome:
     """Do what is still to be done of a job; called again after an interruption, it goes on there.
 
-    Raises ExperimentError where the folder holds another scenario's experiment.
+    Raises SimulationError where the folder holds another scenario's experiment.
     """
     from simulator.truth import read_truth
 
@@ -129,21 +127,13 @@ def run(job: Job, *, progress: Progress = silent) -> Outcome:
 
 def _simulate(job: Job, state: State, state_path: Path, progress: Progress) -> bool:
     """Simulate unless that is done; returns whether it was."""
-    wanted = fingerprint(job.scenario.template())
-    finished = (job.experiment / DESCRIPTION).exists()
-    if job.experiment.exists() and state.scenario != wanted:
-        raise ExperimentError(
-            f"{job.experiment}: expected an experiment of scenario {job.scenario.name} as it is now, found another; "
-            "choose another folder, or remove this one"
-        )
-    if finished:
-        return True
-    from simulator.scanner import simulate
+    from simulator.scanner import check_folder, simulate
 
+    check_folder(job.scenario, job.experiment)
+    if (job.experiment / DESCRIPTION).exists():
+        return True
     if not job.experiment.exists():
         state.seconds.pop("simulate", None)
-    state.scenario = wanted
-    state.write(state_path)
     with _noting("simulate", state, state_path):
         simulate(job.scenario, job.experiment, progress=progress, workers=job.workers)
     return False
