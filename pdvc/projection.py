@@ -180,16 +180,19 @@ def _moved_box(volume: Volume, heights: Floats, maps: Floats) -> Floats:
     """
     low, high = volume.hull.box_mm()
     origin = np.array(volume.grid.origin_mm)
-    box = np.array([low - origin, high - origin]) / volume.grid.voxel_mm
+    start = np.array([low - origin, high - origin]) / volume.grid.voxel_mm
+    box = start
     for _ in range(2):
-        corners = np.array(np.meshgrid(*box.T, indexing="ij")).reshape(3, -1).T
-        ends = np.concatenate(
-            [np.column_stack([corners[:, :2], np.full(len(corners), z)]) for z in (*heights, *box[:, 2])]
+        x, y = np.repeat(box[:, 0], 2), np.tile(box[:, 1], 2)
+        z = np.concatenate([heights, box[:, 2]])
+        corners = np.stack(np.broadcast_arrays(x[:, None], y[:, None], z), axis=-1).reshape(-1, 3)
+        moved = np.tensordot(maps[..., :3], corners, axes=(2, 1)) + maps[..., 3, None]
+        box = np.array(
+            [
+                start[0] + np.minimum(moved.min(axis=(0, 2)), 0) - 1,
+                start[1] + np.maximum(moved.max(axis=(0, 2)), 0) + 1,
+            ]
         )
-        moved = np.einsum("jab,pb->jpa", maps[..., :3], ends) + maps[..., None, :, 3]
-        reach_low, reach_high = moved.min(axis=(0, 1)), moved.max(axis=(0, 1))
-        start = np.array([low - origin, high - origin]) / volume.grid.voxel_mm
-        box = np.array([start[0] + np.minimum(reach_low, 0) - 1, start[1] + np.maximum(reach_high, 0) + 1])
     return box
 
 
@@ -199,22 +202,19 @@ def _band_sections(
     """Return each band's lowest section, and the largest number of sections that any band touches."""
     rows, columns = shape
     bands = -(-rows // BAND_ROWS)
-    low, high = np.empty(bands, dtype=np.int64), np.empty(bands, dtype=np.int64)
-    middle = box.mean(axis=0)
+    first = np.arange(bands) * BAND_ROWS
+    row = np.stack([first, np.minimum(first + BAND_ROWS, rows) - 1])[..., None]
+    column = np.array([0, columns - 1])
+    slope = [rays[1, i] + row * rays[2, i] + column * rays[3, i] - rays[0, i] for i in range(3)]
+    rise = slope[2] / np.hypot(slope[0], slope[1])
+    near = np.hypot(*(box.mean(axis=0)[:2] - rays[0, :2]))
     reach = np.linalg.norm(box[1, :2] - box[0, :2]) / 2 + 1
-    for band in range(bands):
-        ends = (band * BAND_ROWS, min((band + 1) * BAND_ROWS, rows) - 1)
-        z = []
-        for row in ends:
-            for column in (0, columns - 1):
-                ray = rays[1] + row * rays[2] + column * rays[3] - rays[0]
-                length = np.hypot(ray[0], ray[1])
-                near = np.hypot(*(middle[:2] - rays[0, :2]))
-                # half a percent more: rays at the edges are longer than their distance to the axis
-                z += [rays[0, 2] + ray[2] / length * s for s in (0.995 * near - reach, 1.005 * near + reach)]
-        low[band] = max(np.searchsorted(heights, min(z) - 1, side="right") - 1, 0)
-        high[band] = min(np.searchsorted(heights, max(z) + 1, side="left"), len(heights) - 1)
-    high = np.maximum(high, low)
+    # half a percent more: rays at the edges are longer than their distance to the axis
+    z = rays[0, 2] + np.stack([rise * (0.995 * near - reach), rise * (1.005 * near + reach)])
+    low = np.searchsorted(heights, z.min(axis=(0, 1, 3)) - 1, side="right") - 1
+    high = np.searchsorted(heights, z.max(axis=(0, 1, 3)) + 1, side="left")
+    low = np.clip(low, 0, len(heights) - 1)
+    high = np.clip(high, low, len(heights) - 1)
     return low, int((high - low).max()) + 1
 
 
@@ -325,25 +325,28 @@ def _clip_hull(place, support, normals, a, b, path):  # type: ignore[no-untyped-
     return a + low * (b - a), a + high * (b - a)
 
 
+@njit(nogil=True, cache=True, inline="always")
+def _quadratic_row(first, second, i, base, along, s0, s1):  # type: ignore[no-untyped-def]
+    """Return coordinate i of x'(l) = x - u(x), with u = (1 - s) u_first + s u_second, s = s0 + s1 l."""
+    p = first[i, 0] * base[0] + first[i, 1] * base[1] + first[i, 2] * base[2] + first[i, 3]
+    q = first[i, 0] * along[0] + first[i, 1] * along[1] + first[i, 2] * along[2]
+    dp = second[i, 0] * base[0] + second[i, 1] * base[1] + second[i, 2] * base[2] + second[i, 3] - p
+    dq = second[i, 0] * along[0] + second[i, 1] * along[1] + second[i, 2] * along[2] - q
+    return base[i] - p - s0 * dp, along[i] - q - s0 * dq - s1 * dp, -s1 * dq
+
+
 @njit(nogil=True, cache=True)
 def _quadratic(first, second, base, along, s0, s1):  # type: ignore[no-untyped-def]
-    """Return the coefficients of x'(l) = x - u(x), with u = (1 - s) u_first + s u_second, s = s0 + s1 l."""
-    c = np.empty((3, 3))
-    for i in range(3):
-        p = first[i, 0] * base[0] + first[i, 1] * base[1] + first[i, 2] * base[2] + first[i, 3]
-        q = first[i, 0] * along[0] + first[i, 1] * along[1] + first[i, 2] * along[2]
-        dp = second[i, 0] * base[0] + second[i, 1] * base[1] + second[i, 2] * base[2] + second[i, 3] - p
-        dq = second[i, 0] * along[0] + second[i, 1] * along[1] + second[i, 2] * along[2] - q
-        c[i, 0] = base[i] - p - s0 * dp
-        c[i, 1] = along[i] - q - s0 * dq - s1 * dp
-        c[i, 2] = -s1 * dq
-    return (c[0, 0], c[0, 1], c[0, 2], c[1, 0], c[1, 1], c[1, 2], c[2, 0], c[2, 1], c[2, 2])
+    """Return the nine coefficients of the moved ray x'(l), coordinate by coordinate."""
+    ax, bx, cx = _quadratic_row(first, second, 0, base, along, s0, s1)
+    ay, by, cy = _quadratic_row(first, second, 1, base, along, s0, s1)
+    az, bz, cz = _quadratic_row(first, second, 2, base, along, s0, s1)
+    return ax, bx, cx, ay, by, cy, az, bz, cz
 
 
-@njit(nogil=True, cache=True)
-def _add_section(pattern, w0, w1, base, along, sums, scale, out):  # type: ignore[no-untyped-def]
-    """Add to `out` (motion,) the integral of (w0 + w1 l) Psi(x(l)) . grad F, from the nine sums."""
-    k = np.empty(12)
+@njit(nogil=True, cache=True, fastmath=True)
+def _add_section(pattern, w0, w1, base, along, sums, scale, k, out):  # type: ignore[no-untyped-def]
+    """Add to `out` (motion,) the integral of (w0 + w1 l) Psi(x(l)) . grad F, from the nine sums; `k` is scratch."""
     for i in range(3):
         m0, m1, m2 = sums[1 + i], sums[4 + i], sums[7 + i]
         flat, tilted = (w0 * m0 + w1 * m1) * scale, (w0 * m1 + w1 * m2) * scale
@@ -447,7 +450,7 @@ def _walk_band(  # type: ignore[no-untyped-def]
     scale = step * voxel_mm
     normals = _NORMALS
     s = np.zeros(max(vector.shape[0], 1))
-    base, along = np.empty(3), np.empty(3)
+    base, along, k12 = np.empty(3), np.empty(3), np.empty(12)
     middle = 0.5 * (box[0] + box[1])
     for row in range(band * BAND_ROWS, min((band + 1) * BAND_ROWS, rows)):
         for column in range(columns):
@@ -507,23 +510,15 @@ def _walk_band(  # type: ignore[no-untyped-def]
                             if k_last < 0:
                                 k_first, k_last = j0, j1
                             k_first, k_last = min(k_first, j0), max(k_last, j1)
+                            at = (j0 - low) * motions
+                            out = s[at : at + motions]
                             if j0 == j1:
-                                at = (j0 - low) * motions
-                                _add_section(patterns[j0], 1.0, 0.0, base, along, sums, scale, s[at : at + motions])
+                                _add_section(patterns[j0], 1.0, 0.0, base, along, sums, scale, k12, out)
                             else:
-                                at = (j0 - low) * motions
-                                _add_section(
-                                    patterns[j0],
-                                    1.0 - s0,
-                                    -s1,
-                                    base,
-                                    along,
-                                    sums,
-                                    scale,
-                                    s[at : at + motions],
-                                )
+                                _add_section(patterns[j0], 1.0 - s0, -s1, base, along, sums, scale, k12, out)
                                 at = (j1 - low) * motions
-                                _add_section(patterns[j1], s0, s1, base, along, sums, scale, s[at : at + motions])
+                                out = s[at : at + motions]
+                                _add_section(patterns[j1], s0, s1, base, along, sums, scale, k12, out)
                         else:
                             value += _sum_values(volume, stride_y, stride_z, limit, first, last, step32, path32)
                 a = b
