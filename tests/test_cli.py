@@ -182,6 +182,9 @@ stroke_mm_per_s = 0.01
 """
 
 
+one_worker = pytest.mark.xdist_group("job")  # or two workers would each do the job
+
+
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
     """Do the main job once; the tests below look at what it left."""
@@ -193,6 +196,7 @@ def job(tmp_path_factory):
     return folder, result
 
 
+@one_worker
 def test_the_job_writes_all_it_promises(job):
     folder, result = job
     out = folder / "out"
@@ -204,6 +208,7 @@ def test_the_job_writes_all_it_promises(job):
     assert not list(out.rglob("*.partial"))
 
 
+@one_worker
 def test_scores_are_complete_and_plausible(job):
     folder, _ = job
     values = json.loads((folder / "out" / "scores.json").read_text())
@@ -215,6 +220,7 @@ def test_scores_are_complete_and_plausible(job):
     assert values["error_voxel"]["across_beam"] < 0.3
 
 
+@one_worker
 def test_asked_again_the_job_repeats_only_scores_and_report(job):
     folder, _ = job
     out = folder / "out"
@@ -231,6 +237,7 @@ def test_asked_again_the_job_repeats_only_scores_and_report(job):
     assert (out / "report.html").is_file()
 
 
+@one_worker
 def test_another_scenario_does_not_overwrite_a_job(job):
     folder, _ = job
     other = folder / "other.toml"
@@ -240,6 +247,7 @@ def test_another_scenario_does_not_overwrite_a_job(job):
     assert "acquisition.reference_views differs" in only_line(result)
 
 
+@one_worker
 def test_score_and_report_alone_agree_with_the_run(job):
     folder, _ = job
     out = folder / "out"
@@ -253,6 +261,7 @@ def test_score_and_report_alone_agree_with_the_run(job):
     assert len(list((folder / "page" / "figures").glob("*.png"))) == 10
 
 
+@one_worker
 def test_a_truncated_stack_is_named(job):
     folder, _ = job
     copy = folder / "copy"

@@ -184,3 +184,13 @@ def test_unobserved_amplitudes_do_not_leak_into_observed_points():
     whole = measured_at(records.measurement(amplitude), points)
     part = measured_at(records.measurement(amplitude, unobserved=(0, 8)), points)
     np.testing.assert_array_equal(whole, part)
+
+
+def test_a_level_that_leaves_the_field_does_not_make_the_mean_translation_jump():
+    # a rigid shift, and a stretch that makes the levels differ
+    offset = np.zeros((6, 3))
+    offset[:, 2] = np.linspace(0, 1, 6)
+    truth, amplitude = records.stretched(np.full(6, 0.05), offset)
+    axis = axis_history(records.measurement(amplitude), truth)
+    assert np.isnan(axis.measured[..., 2]).any(axis=1).sum() > 1
+    np.testing.assert_allclose(np.diff(axis.translation(axis.measured)[:, 2]), 0.2 / VOXEL)

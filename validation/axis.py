@@ -43,16 +43,19 @@ class AxisHistory:
     voxel_mm: float
 
     def translation(self, displacement: Floats) -> Floats:
-        """Return the mean over the levels (step, 3), voxels."""
-        return nan_mean(displacement, axis=1)
+        """Return the mean over the levels that are observed at every step (step, 3), voxels.
+
+        A level that comes or goes would make the mean jump.
+        """
+        always = np.isfinite(self.measured).all(axis=(0, 2))
+        return nan_mean(displacement[:, always] if always.any() else displacement, axis=1)
 
     def stretch(self, displacement: Floats) -> Floats:
         """Return u_z without its mean over the levels (step, level), voxels.
 
         On the axis a small rotation moves nothing vertically, so that the mean is all of the rigid motion.
         """
-        vertical = displacement[..., 2]
-        return np.asarray(vertical - nan_mean(vertical, axis=1)[:, None])
+        return np.asarray(displacement[..., 2] - self.translation(displacement)[:, None, 2])
 
     def strain(self, displacement: Floats) -> Floats:
         """Return the engineering strain between neighbouring levels (step, level - 1), without unit."""

@@ -120,8 +120,8 @@ def _translations(axis: AxisHistory) -> Picture:
     draw.draw_translations(axis, ax)
     return Picture(
         name="fig07_translations",
-        caption="Translation of the sample at the end of the procedure, averaged over the axis between the "
-        "lowest and the highest observed section, in the frame of the sample."
+        caption="Translation of the sample at the end of the procedure, averaged over the heights on the "
+        "axis that are observed at every step, in the frame of the sample."
         + ("" if axis.true is None else " Dashed: the truth."),
         figure=figure,
     )
@@ -165,8 +165,8 @@ def _errors(measurement: Measurement, truth: TruePoints) -> Picture:
     draw.draw_errors(point_errors(measurement, truth).by_step(), ax)
     return Picture(
         name="errors",
-        caption="Error of each step, rms over the material points between the observed sections. One "
-        "radiograph hardly sees motion along its beam, which the red curve shows.",
+        caption="Error of each step, rms over the material points between the observed sections. What one "
+        "radiograph hardly shows, the motion along its beam, is known through the steps seen from other sides.",
         figure=figure,
     )
 
