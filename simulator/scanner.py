@@ -1,0 +1,166 @@
+"""Carry out a scenario: write an experiment folder and the truth beside it.
+
+Files are written in this order: the scenario, the true displacements, flats, darks, reference scan, test, and
+last `experiment.toml`, which declares the folder complete. Every image has its own random generator, seeded
+by (seed, stack, number): counts depend neither on the number of workers nor on interruptions, and a run that
+was interrupted goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.experiment import (
+    DARKS,
+    DESCRIPTION,
+    FLATS,
+    REFERENCE,
+    TEST,
+    AcquisitionEntry,
+    Description,
+    GeometryEntry,
+    StackEntry,
+    StackWriter,
+    write_description,
+)
+from pdvc.progress import Progress, silent
+from simulator.detector import expose_dark, expose_flat
+from simulator.scenario import Course, Scenario, course_of
+from simulator.truth import SCENARIO, read_scenario, sample_truth, write_scenario, write_truth
+from simulator.views import Image, prepare, step_image, stream, view_image
+
+Floats = NDArray[np.float64]
+
+
+class SimulationError(ValueError):
+    """Say why a scenario cannot be carried out in a folder, and what to do."""
+
+
+def simulate(scenario: Scenario, folder: Path, *, progress: Progress = silent, workers: int | None = None) -> None:
+    """Carry out a scenario and write its experiment folder, or go on with it where it was interrupted.
+
+    `workers` radiographs are computed side by side, by default as many as there are processors.
+    Raises SimulationError where the folder holds something else or the disk is full.
+    """
+    check_folder(scenario, folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / DESCRIPTION).unlink(missing_ok=True)
+        write_scenario(folder, scenario)
+        _write_all(scenario, folder, progress, workers or os.cpu_count() or 1)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        raise SimulationError(
+            f"{folder}: disk full: {scenario.name} needs {_size_mb(scenario):.0f} MB; free some space and run the "
+            "same command again, it goes on where it stopped"
+        ) from None
+
+
+def check_folder(scenario: Scenario, folder: Path) -> None:
+    """Refuse a folder that holds something else than a run of this scenario."""
+    if (folder / SCENARIO).is_file():
+        found = read_scenario(folder)
+        if found != scenario:
+            key = first_difference(found.model_dump(), scenario.model_dump())
+            raise SimulationError(
+                f"{folder}: holds a run of another scenario ({found.name}; {key} differs): "
+                "choose another folder, or delete this one"
+            )
+        return
+    for name in (DESCRIPTION, REFERENCE, TEST, FLATS, DARKS):
+        if (folder / name).exists():
+            raise SimulationError(
+                f"{folder}: holds {name} of an experiment that was not simulated: choose another folder"
+            )
+
+
+def first_difference(one: dict[str, Any], other: dict[str, Any]) -> str:
+    """Return the path of the first key whose values differ in two nested records."""
+    for key, value in one.items():
+        if value != other[key]:
+            return f"{key}.{first_difference(value, other[key])}" if isinstance(value, dict) else key
+    return ""
+
+
+def _write_all(scenario: Scenario, folder: Path, progress: Progress, workers: int) -> None:
+    progress("sample", 0, 1)
+    course = course_of(scenario)
+    write_truth(folder, sample_truth(scenario, course))
+    scanner = prepare(scenario, course)
+    detector, maps = scenario.detector, scanner.maps
+    progress("sample", 1, 1)
+    stacks: tuple[tuple[str, str, int, Callable[[int], Image]], ...] = (
+        ("flats", FLATS, detector.flats, lambda k: expose_flat(detector, maps, stream(scenario, "flats", k))),
+        ("darks", DARKS, detector.darks, lambda k: expose_dark(detector, maps, stream(scenario, "darks", k))),
+        ("reference", REFERENCE, scenario.acquisition.reference_views, lambda k: view_image(scanner, k)),
+        ("test", TEST, scenario.acquisition.test_steps, lambda k: step_image(scanner, k)),
+    )
+    shape = scenario.geometry.rows, scenario.geometry.columns
+    for task, name, count, make in stacks:
+        with StackWriter(folder / name, (count, *shape)) as writer:
+            progress(task, writer.done, count)
+            for index, image in in_order(make, range(writer.done, count), workers):
+                writer.write(index, image)
+                progress(task, writer.done, count)
+    write_description(folder, describe(scenario, course))
+
+
+def in_order(make: Callable[[int], Image], indices: range, workers: int) -> Iterator[tuple[int, Image]]:
+    """Compute images side by side and yield them in order, a few ahead at most: memory stays bounded."""
+    waiting: deque[tuple[int, Future[Image]]] = deque()
+    pool = ThreadPoolExecutor(workers)
+    try:
+        for index in indices:
+            waiting.append((index, pool.submit(make, index)))
+            if len(waiting) > workers + 1:
+                first, future = waiting.popleft()
+                yield first, future.result()
+        while waiting:
+            first, future = waiting.popleft()
+            yield first, future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def describe(scenario: Scenario, course: Course) -> Description:
+    """Return what the laboratory would write down: recorded geometry, angles, times and measured forces."""
+    rng = stream(scenario, "force")
+    views, noise = scenario.acquisition.reference_views, scenario.acquisition.force_noise_N
+    at_rest = scenario.loading.plateau_N + noise * rng.standard_normal(views)
+    force = course.history.force_N + noise * rng.standard_normal(len(course.test_time_s))
+    return Description(
+        title=scenario.title,
+        material=scenario.material,
+        geometry=GeometryEntry(**scenario.geometry.model_dump()),
+        acquisition=AcquisitionEntry(
+            frames=scenario.detector.frames,
+            photons_per_count=scenario.detector.photons_per_count,
+            readout_noise_counts=scenario.detector.readout_noise_counts,
+        ),
+        reference=_stack_entry(course.reference_angle_rad, course.reference_time_s, at_rest),
+        test=_stack_entry(course.test_angle_rad, course.test_time_s, force),
+    )
+
+
+def _stack_entry(angle_rad: Floats, time_s: Floats, force_N: Floats) -> StackEntry:
+    return StackEntry(
+        angle_deg=tuple(np.rad2deg(angle_rad).round(10).tolist()),
+        time_s=tuple(time_s.round(6).tolist()),
+        force_N=tuple(force_N.tolist()),
+    )
+
+
+def _size_mb(scenario: Scenario) -> float:
+    plan, detector = scenario.acquisition, scenario.detector
+    images = plan.reference_views + plan.test_steps + detector.flats + detector.darks
+    return images * scenario.geometry.rows * scenario.geometry.columns * 2e-6 + 10
