@@ -1,0 +1,87 @@
+"""The measurement's NetCDF file: every field comes back, and what is no measurement is refused by name."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pdvc.measurement import MeasurementError, read_measurement, write_measurement
+from tests import synthetic_records as records
+
+RESIDUALS = ("residual_initial", "residual_rigid", "residual_final")
+
+
+@pytest.fixture(scope="module")
+def measured():
+    amplitude = np.random.default_rng(5).normal(size=(records.STEPS, 9, 6))
+    record = records.measurement(amplitude, unobserved=(0, 8), title="dog-bone, 'A' # 1")
+    residual = record.residual_final.copy()
+    residual[3, :2] = np.nan
+    return replace(record, residual_final=residual, snr_noise_db=np.full(records.STEPS, np.nan), options="")
+
+
+def assert_same(one, two, name):
+    if isinstance(one, np.ndarray):
+        np.testing.assert_array_equal(one, two, err_msg=name)
+        assert one.dtype == two.dtype, name
+    else:
+        assert one == two, name
+
+
+def test_every_field_comes_back(measured, tmp_path):
+    write_measurement(measured, tmp_path / "a.nc")
+    again = read_measurement(tmp_path / "a.nc")
+    for field in fields(measured):
+        if field.name not in (*RESIDUALS, "basis", "stages"):
+            assert_same(getattr(measured, field.name), getattr(again, field.name), field.name)
+    for field in fields(measured.basis):
+        assert_same(getattr(measured.basis, field.name), getattr(again.basis, field.name), field.name)
+    assert len(again.stages) == len(measured.stages)
+    for one, two in zip(measured.stages, again.stages, strict=True):
+        for field in fields(one):
+            assert_same(getattr(one, field.name), getattr(two, field.name), field.name)
+
+
+def test_residuals_come_back_to_half_their_quantum_and_their_gaps_as_gaps(measured, tmp_path):
+    write_measurement(measured, tmp_path / "a.nc")
+    again = read_measurement(tmp_path / "a.nc")
+    for name in RESIDUALS:
+        np.testing.assert_allclose(getattr(again, name), getattr(measured, name), atol=5.1e-5, err_msg=name)
+    assert np.isnan(again.residual_final[3, :2]).all()
+
+
+def test_a_solver_without_modes_has_none_when_read_back(measured, tmp_path):
+    stage = replace(measured.stages[1], solver="gauss-newton", temporal=np.empty((0, 24)), spatial=np.empty((0, 9, 6)))
+    write_measurement(replace(measured, stages=(measured.stages[0], stage)), tmp_path / "a.nc")
+    again = read_measurement(tmp_path / "a.nc").stages[1]
+    assert again.modes == 0
+    assert again.spatial.shape == (0, 9, 6)
+
+
+def test_nothing_but_the_finished_file_is_left(measured, tmp_path):
+    write_measurement(measured, tmp_path / "results" / "a.nc")
+    assert [path.name for path in (tmp_path / "results").iterdir()] == ["a.nc"]
+
+
+# h5netcdf complains, when collected, that the file it could not open has no state to close
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
+def test_a_truncated_file_is_refused_by_name(measured, tmp_path, share):
+    path = tmp_path / "a.nc"
+    write_measurement(measured, path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 1"):
+        read_measurement(path)
+
+
+def test_another_netcdf_file_is_refused_by_name(tmp_path):
+    xr.Dataset({"a": ("x", np.arange(3))}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 1"):
+        read_measurement(tmp_path / "a.nc")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement file, found none"):
+        read_measurement(tmp_path / "a.nc")
