@@ -24,7 +24,6 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
-from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -252,7 +251,6 @@ def into_sections(motion: Motion, height_mm: Floats, time: Floats) -> SectionMot
 
 def _from_origin(height_mm: Floats, slope: Floats) -> Floats:
     """Integrate along z, from 0 at height 0: heights on axis 0 of a profile, or on axis 1 of (step, ...)."""
-    axis = 0 if slope.ndim == 1 else 1
-    total = cumulative_trapezoid(slope, height_mm, axis=axis, initial=0.0)
-    at_zero = CubicSpline(height_mm, total, axis=axis)(0.0)
-    return total - (at_zero if axis == 0 else at_zero[:, None])
+    integral = CubicSpline(height_mm, slope, axis=0 if slope.ndim == 1 else 1).antiderivative()
+    from_zero = integral(height_mm) - np.expand_dims(integral(0.0), 0 if slope.ndim == 1 else 1)
+    return np.asarray(from_zero, dtype=np.float64)

@@ -35,7 +35,7 @@ from pdvc.experiment import (
 from pdvc.progress import Progress, silent
 from simulator.detector import expose_dark, expose_flat
 from simulator.scenario import Course, Scenario, course_of
-from simulator.truth import SCENARIO, read_scenario, sample_truth, write_scenario, write_truth
+from simulator.truth import DISPLACEMENT, SCENARIO, read_scenario, sample_truth, write_scenario, write_truth
 from simulator.views import Image, prepare, step_image, stream, view_image
 
 Floats = NDArray[np.float64]
@@ -52,6 +52,8 @@ def simulate(scenario: Scenario, folder: Path, *, progress: Progress = silent, w
     Raises SimulationError where the folder holds something else or the disk is full.
     """
     check_folder(scenario, folder)
+    if all((folder / name).is_file() for name in (DESCRIPTION, DISPLACEMENT, FLATS, DARKS, REFERENCE, TEST)):
+        return
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / DESCRIPTION).unlink(missing_ok=True)

@@ -6,10 +6,12 @@ import math
 
 import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from pdvc.experiment import AcquisitionEntry, Description, GeometryEntry, StackEntry
 from pdvc.geometry import ConeBeam
 from pdvc.sections import RIGID, SectionBasis
+from simulator.kinematics import BeamMotion, RigidMotion, SectionMotion
 
 
 @st.composite

@@ -1,0 +1,210 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from simulator.ingredients import (
+    Bending,
+    Compliance,
+    MotionOptions,
+    Torsion,
+    Wobble,
+    build_motion,
+    into_sections,
+    time_functions,
+    wobble_motion,
+)
+from simulator.kinematics import BeamMotion, Composition, MotionError, RigidMotion, SectionMotion, rotation_matrix
+from simulator.loading import Loading, load_history
+from simulator.specimen import Specimen, area_mm2
+from tests.strategies import beam_motions, motions, rigid_motions, section_motions
+
+FEW = settings(max_examples=40, deadline=None)
+ANGLE = 2 * np.pi * np.arange(127) / 50
+HEIGHT = np.linspace(-6.5, 6.5, 261)
+AREA = area_mm2(Specimen(thinned="both"), HEIGHT)
+HISTORY = load_history(Loading(), 2.0 * np.arange(127), HEIGHT, AREA)
+
+
+def material_points(seed: int = 0, count: int = 200):
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 3)) * [1.5, 1.2, 6.4]
+
+
+def paper_motion(**changes):
+    return build_motion(MotionOptions(**changes), HISTORY, AREA, ANGLE, 50, 4.03)
+
+
+@FEW
+@given(motions, st.integers(0, 100))
+def test_inverse_undoes_forward(motion, seed):
+    points = material_points(seed)
+    np.testing.assert_allclose(motion.inverse(motion.forward(points, 0), 0), points, atol=1e-10)
+
+
+@FEW
+@given(st.lists(motions, max_size=3))
+def test_inverse_undoes_a_composition(parts):
+    points = material_points()
+    motion = Composition(tuple(parts))
+    np.testing.assert_allclose(motion.inverse(motion.forward(points, 0), 0), points, atol=1e-9)
+
+
+@FEW
+@given(rigid_motions() | beam_motions())
+def test_gradient_is_that_of_finite_differences(motion):
+    check_gradient(motion, material_points(), 0)
+
+
+@FEW
+@given(section_motions())
+def test_gradient_of_sections_is_that_of_finite_differences(motion):
+    points = material_points()
+    # hat functions have kinks at the sections, where no difference quotient is a gradient
+    height = motion.forward(points, 0)[:, 2]
+    smooth = np.min(np.abs(height[:, None] - motion.height_mm), axis=1) > 1e-3
+    check_gradient(motion, points[smooth], 0)
+
+
+def test_gradient_of_a_composition_follows_the_chain_rule():
+    check_gradient(paper_motion(), material_points(), 126)
+
+
+def check_gradient(motion, points, step):
+    size = 1e-5
+    columns = [
+        (motion.forward(points + size * e, step) - motion.forward(points - size * e, step)) / (2 * size)
+        for e in np.eye(3)
+    ]
+    np.testing.assert_allclose(motion.gradient(points, step), np.stack(columns, axis=-1), atol=1e-8)
+
+
+@FEW
+@given(rigid_motions())
+def test_rigid_motion_keeps_distances_and_its_rotation_is_the_known_one(motion):
+    points = material_points()
+    moved = motion.forward(points, 0)
+    np.testing.assert_allclose(
+        np.linalg.norm(moved[1:] - moved[:-1], axis=1), np.linalg.norm(points[1:] - points[:-1], axis=1), rtol=1e-12
+    )
+    expected = Rotation.from_rotvec(motion.rotation_rad[0]).as_matrix()
+    np.testing.assert_allclose(motion.gradient(points, 0)[0], expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.0199, 0.0201, 3.0])
+def test_rotation_matrix_at_all_sizes(angle):
+    vector = angle * np.array([2.0, -1.0, 2.0]) / 3
+    np.testing.assert_allclose(rotation_matrix(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
+
+
+@FEW
+@given(section_motions())
+def test_section_motion_lies_in_the_solvers_space(motion):
+    # Eq. 18, written out: hat functions times rigid motions at the current position
+    x = motion.forward(material_points(), 0)
+    hats = np.stack([np.interp(x[:, 2], motion.height_mm, row) for row in np.eye(5)], axis=1)
+    arms = x[:, None] - motion.height_mm[:, None] * np.array([0.0, 0.0, 1.0])
+    rigid = motion.translation_mm[0] + np.cross(motion.rotation_rad[0], arms)
+    np.testing.assert_allclose(x - material_points(), np.einsum("pj,pja->pa", hats, rigid), atol=1e-10)
+
+
+def test_crossing_sections_are_refused():
+    shift = np.zeros((1, 5, 3))
+    shift[0, 2, 2] = -9.0
+    knots = np.linspace(-6, 6, 5)
+    beam = BeamMotion(knot_mm=knots, displacement_mm=shift, rotation_rad=np.zeros((1, 5, 3)), stretch=np.ones((1, 5)))
+    with pytest.raises(MotionError, match="step 0: the sections cross"):
+        beam.inverse(material_points(), 0)
+
+
+def test_no_ingredient_is_rest():
+    motion = paper_motion(ingredients=())
+    points = material_points()
+    np.testing.assert_array_equal(motion.forward(points, 126), points)
+    np.testing.assert_array_equal(motion.gradient(points, 126)[7], np.eye(3))
+
+
+def test_tension_has_the_strain_and_contraction_of_the_loading():
+    motion = paper_motion(ingredients=("tension",))
+    points = np.column_stack([np.zeros((len(HEIGHT), 2)), HEIGHT])
+    gradient = motion.gradient(points, 126)
+    inside = np.abs(HEIGHT) < 6
+    np.testing.assert_allclose(gradient[inside, 2, 2] - 1, HISTORY.strain[126, inside], atol=3e-5)
+    elastic = HISTORY.strain[126] - HISTORY.plastic[126]
+    expected = 1 - 0.28 * elastic - 0.5 * HISTORY.plastic[126]
+    np.testing.assert_allclose(gradient[:, 0, 0], expected, atol=1e-12)
+    np.testing.assert_allclose(motion.forward(np.zeros((1, 3)), 126), 0.0, atol=1e-12)
+
+
+def test_contraction_can_be_left_out():
+    motion = paper_motion(ingredients=("tension",), tension={"contraction": False})
+    np.testing.assert_array_equal(motion.gradient(material_points(), 126)[:, 0, 0], 1.0)
+
+
+def test_bending_and_torsion_turn_the_ends_by_their_angle():
+    bending = paper_motion(ingredients=("bending",), bending=Bending(angle_deg=2.0, direction_deg=0.0))
+    torsion = paper_motion(ingredients=("torsion",), torsion=Torsion(angle_deg=3.0))
+    ends = np.array([[0, 0, 4.03], [0, 0, -4.03]])
+    top, bottom = (Rotation.from_matrix(m) for m in bending.gradient(ends, 126))
+    np.testing.assert_allclose((top * bottom.inv()).as_rotvec(degrees=True), [0, 2, 0], atol=1e-3)
+    top, bottom = (Rotation.from_matrix(m) for m in torsion.gradient(ends, 126))
+    np.testing.assert_allclose((top * bottom.inv()).as_rotvec(degrees=True), [0, 0, 3], atol=1e-3)
+    # an unstretched centre line keeps its length
+    line = np.column_stack([np.zeros((1001, 2)), np.linspace(-6, 6, 1001)])
+    length = np.linalg.norm(np.diff(bending.forward(line, 126), axis=0), axis=1).sum()
+    assert length == pytest.approx(12, abs=1e-6)
+
+
+def test_compliance_is_in_proportion_to_the_force():
+    options = Compliance(shift_mm=(0.1, 0.0, -0.2), tilt_deg=(0.0, 0.0, 0.0))
+    motion = paper_motion(ingredients=("compliance",), compliance=options)
+    shift = np.array([motion.forward(np.zeros((1, 3)), step)[0] for step in (0, 90, 126)])
+    load = (HISTORY.force_N[90] - 250) / (HISTORY.force_N[126] - 250)
+    np.testing.assert_allclose(shift, np.outer([0, load, 1], [0.1, 0, -0.2]), atol=1e-15)
+
+
+def test_backlash_comes_before_the_test_and_with_the_stroke():
+    motion = paper_motion(ingredients=("backlash",))
+    path = np.array([motion.forward(np.zeros((1, 3)), step)[0] for step in range(127)])
+    moved = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    np.testing.assert_array_equal(np.flatnonzero(moved > 1e-12), [50, 51, 52])
+    np.testing.assert_allclose(path[0], [0.18, 0.03, 0.03])
+
+
+def test_wobble_stands_still_in_the_lab():
+    # a point of the axis, turned into the lab by the stage, is always shifted by the same vector
+    motion = wobble_motion(Wobble(across_mm=0.05, along_mm=0.02, roll_deg=0.0, lean_deg=0.0), ANGLE)
+    for step in (0, 13, 77):
+        lab = Rotation.from_rotvec([0, 0, ANGLE[step]]).apply(motion.forward(np.zeros((1, 3)), step)[0])
+        np.testing.assert_allclose(lab, [0.02, -0.05, 0.0], atol=1e-15)  # along +x, and to the right: -y
+
+
+def test_into_sections_is_exact_for_what_is_in_the_space():
+    time = time_functions(HISTORY.force_N, ANGLE, 50)
+    rng = np.random.default_rng(1)
+    heights = np.linspace(-4.03, 4.03, 15)
+    known = SectionMotion(
+        height_mm=heights,
+        translation_mm=np.einsum("ti,ija->tja", time, rng.normal(0, 0.01, (7, 15, 3))),
+        rotation_rad=np.einsum("ti,ija->tja", time, rng.normal(0, 1e-4, (7, 15, 3))),
+    )
+    found = into_sections(known, heights, time)
+    np.testing.assert_allclose(found.translation_mm, known.translation_mm, atol=1e-10)
+    np.testing.assert_allclose(found.rotation_rad, known.rotation_rad, atol=1e-10)
+
+
+def test_into_sections_resembles_the_motion_it_replaces():
+    motion = paper_motion()
+    heights = np.linspace(-4.03, 4.03, 15)
+    found = into_sections(motion, heights, time_functions(HISTORY.force_N, ANGLE, 50))
+    axis = np.column_stack([np.zeros((41, 2)), np.linspace(-4, 4, 41)])
+    for step in (20, 80, 126):
+        difference = found.forward(axis, step) - motion.forward(axis, step)
+        assert np.sqrt(np.mean(difference**2)) < 0.01  # mm, of 0.3 mm of motion
+
+
+def test_motions_are_values():
+    motion = RigidMotion(rotation_rad=np.zeros((1, 3)), translation_mm=np.ones((1, 3)))
+    assert replace(motion, translation_mm=np.zeros((1, 3))).forward(np.ones((1, 3)), 0).tolist() == [[1, 1, 1]]

@@ -1,0 +1,225 @@
+import errno
+
+import numpy as np
+import pytest
+import tifffile
+
+from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, read_experiment
+from pdvc.settings import SettingsError
+from simulator import scanner
+from simulator.scanner import SimulationError, in_order, simulate
+from simulator.scenario import Scenario, course_of
+from simulator.truth import DISPLACEMENT, read_scenario, read_truth
+from simulator.views import moved_body, prepare, step_image, transmission
+
+
+def tiny(**changes):
+    """Return an experiment of 40 x 24 px that takes a fraction of a second."""
+    values = {
+        "name": "tiny",
+        "discarded_rows": 4,
+        "specimen": {"facet_mm": 0.12, "thinned": "both"},
+        "graphite": {"mean_diameter_mm": 0.2, "smallest_diameter_mm": 0.1, "largest_diameter_mm": 0.4},
+        "geometry": {"rows": 40, "columns": 24, "pixel_mm": 7.1},
+        "acquisition": {"reference_views": 20, "test_steps": 20, "steps_per_turn": 10, "subpixels": 2},
+        "loading": {"plateau_steps": 8, "stroke_mm_per_s": 0.01, "necking_strain": 0.0},
+    }
+    for key, value in changes.items():
+        values[key] = {**values[key], **value} if isinstance(values.get(key), dict) else value
+    return Scenario.parse(values, where="tiny")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "experiment"
+    simulate(tiny(), path, workers=2)
+    return path
+
+
+def stacks(folder):
+    return [tifffile.imread(folder / name) for name in (REFERENCE, TEST, FLATS)]
+
+
+def test_the_folder_reads_as_an_experiment(folder):
+    experiment = read_experiment(folder)
+    assert experiment.reference.counts.shape == (20, 40, 24)
+    assert experiment.test.counts.shape == (20, 40, 24)
+    assert (len(experiment.flats), len(experiment.darks), experiment.frames) == (2, 1, 5)
+    assert experiment.geometry == tiny().geometry.cone_beam()
+    assert experiment.photons_per_count == pytest.approx(0.2)
+    np.testing.assert_allclose(experiment.test.angle_rad, 2 * np.pi * np.arange(20) / 10, atol=1e-11)
+    np.testing.assert_allclose(experiment.test.force_N, course_of(tiny()).history.force_N, atol=5)
+
+
+def test_the_sample_is_in_the_middle_and_darker_than_the_beam(folder):
+    experiment = read_experiment(folder)
+    open_beam = np.median(experiment.flats, axis=0) - np.median(experiment.darks, axis=0)
+    ratio = (experiment.reference.counts[0] - np.median(experiment.darks, axis=0)) / open_beam
+    assert np.median(ratio[:, 12]) < 0.8
+    assert np.median(ratio[:, :2]) == pytest.approx(1, abs=0.02)
+
+
+def test_truth_holds_scenario_and_displacement(folder):
+    assert read_scenario(folder) == tiny()
+    truth = read_truth(folder)
+    course = course_of(tiny())
+    assert truth.point_mm.shape == (81 * 5, 3)
+    assert truth.displacement_mm.shape == (20, 81 * 5, 3)
+    np.testing.assert_array_equal(truth.point_mm[::5, :2], 0.0)
+    np.testing.assert_array_equal(truth.point_mm[::5, 2], truth.level_mm)
+    moved = truth.point_mm + truth.displacement_mm[19]
+    np.testing.assert_allclose(course.motion.inverse(moved, 19), truth.point_mm, atol=1e-10)
+    np.testing.assert_array_equal(truth.force_N, course.history.force_N)
+
+
+def test_counts_do_not_depend_on_workers(folder, tmp_path):
+    simulate(tiny(), tmp_path, workers=1)
+    for one, two in zip(stacks(tmp_path), stacks(folder), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert (tmp_path / DESCRIPTION).read_bytes() == (folder / DESCRIPTION).read_bytes()
+
+
+def test_the_seed_changes_the_counts(folder, tmp_path):
+    simulate(tiny(seed=1, acquisition={"reference_views": 1, "test_steps": 1}, motion={"ingredients": []}), tmp_path)
+    assert not np.array_equal(tifffile.imread(tmp_path / FLATS), tifffile.imread(folder / FLATS))
+
+
+@pytest.mark.parametrize(("task", "at"), [("reference", 3), ("reference", 19), ("test", 17)])
+def test_an_interrupted_run_goes_on_to_the_same_counts(folder, tmp_path, task, at):
+    def interrupt(name, done, total):
+        if (name, done) == (task, at):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(tiny(), tmp_path, progress=interrupt, workers=2)
+    assert not (tmp_path / DESCRIPTION).exists()
+    assert not (tmp_path / TEST).exists()
+    starts = {}
+    simulate(tiny(), tmp_path, progress=lambda name, done, total: starts.setdefault(name, done), workers=2)
+    assert starts[task] == at
+    for one, two in zip(stacks(tmp_path), stacks(folder), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_a_complete_folder_is_left_alone(folder):
+    stamp = (folder / DESCRIPTION).stat().st_mtime_ns
+    simulate(tiny(), folder, progress=lambda *_: pytest.fail("nothing is left to do"))
+    assert (folder / DESCRIPTION).stat().st_mtime_ns == stamp
+
+
+def test_another_scenario_is_refused_with_the_key_that_differs(folder):
+    with pytest.raises(SimulationError, match=r"another scenario \(tiny; detector\.frames differs\)"):
+        simulate(tiny(detector={"frames": 3}), folder)
+
+
+def test_an_experiment_that_was_not_simulated_is_refused(tmp_path):
+    (tmp_path / DESCRIPTION).write_text("title = 'real data'")
+    with pytest.raises(SimulationError, match=r"holds experiment\.toml of an experiment that was not simulated"):
+        simulate(tiny(), tmp_path)
+    assert (tmp_path / DESCRIPTION).read_text() == "title = 'real data'"
+
+
+def test_a_full_disk_is_told_in_one_line_and_leaves_nothing_that_looks_whole(tmp_path, monkeypatch):
+    class FullDisk(scanner.StackWriter):
+        def write(self, index, image):
+            if self.path.name == "radiographs.tif" and index == 5:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            super().write(index, image)
+
+    monkeypatch.setattr(scanner, "StackWriter", FullDisk)
+    with pytest.raises(SimulationError, match=r"disk full: tiny needs \d+ MB") as caught:
+        simulate(tiny(), tmp_path)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / DESCRIPTION).exists()
+    assert not (tmp_path / REFERENCE).exists()
+
+
+def test_truth_that_is_missing_or_damaged_is_refused(tmp_path):
+    with pytest.raises(SettingsError, match=r"displacement\.nc: expected the truth of a simulated experiment"):
+        read_truth(tmp_path)
+    (tmp_path / "truth").mkdir()
+    (tmp_path / DISPLACEMENT).write_bytes(b"not a file of this kind")
+    with pytest.raises(SettingsError, match=r"displacement\.nc: expected displacement samples"):
+        read_truth(tmp_path)
+
+
+def test_without_motion_the_test_repeats_the_reference(tmp_path):
+    still = tiny(
+        motion={"ingredients": []},
+        acquisition={"steps_per_turn": 20},
+        detector={"photons_per_pixel": 1e9, "readout_noise_counts": 0.0},
+    )
+    simulate(still, tmp_path)
+    reference, test, _ = (stack.astype(float) for stack in stacks(tmp_path))
+    # photon noise is 40000 / sqrt(5e9) = 0.6 counts at most, and rounding adds as much
+    assert np.abs(reference - test).max() < 6
+
+
+def test_with_motion_the_test_differs_by_more_than_noise(folder):
+    reference, test, _ = (stack.astype(float) for stack in stacks(folder))
+    assert np.abs(reference[0] - test[0]).max() > 2000
+
+
+def test_rigid_motion_by_a_step_of_the_stage_looks_like_the_next_view():
+    # wobble-free turn about z by +10 degrees and stage at 0 = no motion and stage at +10 degrees
+    turned = tiny(
+        motion={
+            "ingredients": ["backlash"],
+            "backlash": {
+                "before_mm": [0, 0, 0],
+                "before_deg": [0, 0, 10],
+                "start_mm": [0, 0, 0],
+                "start_deg": [0] * 3,
+            },
+        }
+    )
+    bench = prepare(turned, course_of(turned))
+    body = moved_body(bench.body, bench.course.motion, 0)
+    one = transmission(bench, body, 0.3, 0.0)
+    two = transmission(bench, bench.body, 0.3 + np.deg2rad(10), 0.0)
+    np.testing.assert_allclose(one, two, atol=2e-6)
+
+
+def test_a_lean_along_the_beam_axis_is_seen_and_a_zero_one_is_not():
+    plain, leaning = tiny(), tiny(misalignment={"lean_deg": 5.0})
+    images = []
+    for scenario in (plain, leaning):
+        bench = prepare(scenario, course_of(scenario))
+        images.append(transmission(bench, bench.body, 0.7, 0.0))
+    # the top comes nearer to the detector or the source: its image shrinks or grows, that of the middle stays
+    assert np.abs(images[0] - images[1])[:8].max() > 10 * np.abs(images[0] - images[1])[38:42].mean()
+
+
+def test_exposure_while_turning_is_the_mean_of_still_exposures():
+    turning = tiny(acquisition={"exposure_samples": 2, "exposure_share": 0.5})
+    bench = prepare(turning, course_of(turning))
+    still = prepare(tiny(), course_of(tiny()))
+    mean = sum(transmission(still, still.body, 0.4 + shift, 0.0) for shift in (-0.0125, 0.0125)) / 2
+    np.testing.assert_allclose(transmission(bench, bench.body, 0.4, 0.1), mean, atol=1e-6)
+
+
+def test_images_are_made_only_a_few_ahead():
+    made = []
+
+    def make(index):
+        made.append(index)
+        return np.full((1, 1), index, dtype=np.uint16)
+
+    for index, image in in_order(make, range(40), 2):
+        assert image[0, 0] == index
+        assert len(made) <= index + 5
+    assert sorted(made) == list(range(40))
+
+
+def test_an_error_in_one_image_surfaces():
+    def fail(index):
+        raise RuntimeError(f"image {index}")
+
+    with pytest.raises(RuntimeError, match="image 0"):
+        list(in_order(fail, range(3), 2))
+
+
+def test_images_can_be_made_one_at_a_time(folder):
+    bench = prepare(tiny(), course_of(tiny()))
+    np.testing.assert_array_equal(step_image(bench, 7), tifffile.imread(folder / TEST)[7])

@@ -1,0 +1,102 @@
+import tomllib
+
+import numpy as np
+import pytest
+
+from pdvc.settings import SettingsError
+from simulator.scenario import Misalignment, Scenario, builtin_names, course_of, load_scenario
+
+
+@pytest.mark.parametrize("name", ["in-space", "jailin2018", "quick", "rigid"])
+def test_builtin_scenarios_load_and_are_named_after_their_file(name):
+    assert name in builtin_names()
+    assert load_scenario(name).name == name
+
+
+@pytest.mark.parametrize("name", builtin_names())
+def test_a_scenario_written_as_toml_reads_back_the_same(name, tmp_path):
+    scenario = load_scenario(name)
+    path = tmp_path / "mine.toml"
+    path.write_text(scenario.template(), encoding="utf-8")
+    assert load_scenario(path) == scenario
+
+
+def test_every_key_is_explained():
+    lines = [line for line in Scenario().template().splitlines() if line.strip()]
+    assert all("#" in line for line in lines), [line for line in lines if "#" not in line]
+
+
+def test_the_paper_scenario_has_the_papers_numbers():
+    scenario = load_scenario("jailin2018")
+    scanner = scenario.geometry.cone_beam()
+    assert (scanner.rows, scanner.columns) == (954, 432)
+    assert scanner.voxel_mm == pytest.approx(0.0107)
+    assert 2 * scenario.view_mm == pytest.approx(754 * 0.0107)
+    course = course_of(scenario)
+    assert (len(course.reference_angle_rad), len(course.test_angle_rad)) == (600, 127)
+    assert course.reference_time_s[-1] / 60 == pytest.approx(22, rel=0.01)
+    assert course.test_angle_rad[50] == pytest.approx(2 * np.pi)
+    assert course.history.force_N[49] == 250 < course.history.force_N[-1]
+
+
+def test_quick_is_the_paper_four_times_coarser():
+    quick, paper = load_scenario("quick"), load_scenario("jailin2018")
+    assert quick.geometry.cone_beam().voxel_mm == pytest.approx(4 * paper.geometry.cone_beam().voxel_mm)
+    assert quick.view_mm == pytest.approx(paper.view_mm, rel=0.005)
+    assert (quick.specimen, quick.loading, quick.motion) == (paper.specimen, paper.loading, paper.motion)
+    assert quick.graphite.mean_diameter_mm == 4 * paper.graphite.mean_diameter_mm
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[geometry]\nsource_axis_mm = -3.0", r"geometry\.source_axis_mm: expected greater than 0, given -3\.0"),
+        ("[geometri]\nrows = 3", r"geometri: unknown key"),
+        ("[loading]\nforce = 3", r"loading\.force: unknown key"),
+        ('seed = "a"', r"seed: expected a valid integer.*, given 'a'"),
+        ("[motion]\nsections = 1", r"motion\.sections: expected 0, or at least 2 sections, given 1"),
+        ('[motion]\ningredients = ["swim"]', r"motion\.ingredients\.0: expected 'tension', .*, given 'swim'"),
+        ("[specimen]\nlength_mm = 5.0", r"expected specimen\.length_mm of at least 10\.\d+ mm"),
+        ("discarded_rows = 477", r"discarded_rows below half of the 954 detector rows, got 477"),
+        ("[motion", r"not valid TOML"),
+    ],
+)
+def test_a_wrong_scenario_names_file_key_expected_and_given(text, message, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(SettingsError, match=rf"mine\.toml: .*{message}") as caught:
+        load_scenario(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_an_unknown_name_are_told_apart(tmp_path):
+    with pytest.raises(SettingsError, match=r"none\.toml: expected a TOML file, found none"):
+        load_scenario(tmp_path / "none.toml")
+    with pytest.raises(SettingsError, match=r"expected one of .*quick.*, given 'quik'; did you mean 'quick'\?"):
+        load_scenario("quik")
+
+
+def test_misalignment_adds_to_the_recorded_geometry():
+    recorded = Scenario().geometry.cone_beam()
+    true = Misalignment(column_shift_mm=0.3, roll_deg=2.0, source_axis_mm=0.5).true_geometry(recorded)
+    assert true.column_shift_mm == 0.3
+    assert true.roll_rad == pytest.approx(np.deg2rad(2))
+    assert true.source_axis_mm == recorded.source_axis_mm + 0.5
+    assert Misalignment().true_geometry(recorded) == recorded
+
+
+def test_the_course_of_in_space_is_a_sum_of_the_papers_time_functions():
+    course = course_of(load_scenario("in-space"))
+    history, angle = course.history, course.test_angle_rad
+    step = np.arange(127.0)
+    ramp = np.maximum(step - 50, 0)
+    table_1 = np.stack([history.force_N, np.sin(angle), np.cos(angle), step**0, step, ramp, ramp**2], axis=1)
+    motion = course.motion
+    for values in (motion.translation_mm, motion.rotation_rad):
+        flat = values.reshape(127, -1)
+        fit = table_1 @ np.linalg.lstsq(table_1, flat, rcond=None)[0]
+        np.testing.assert_allclose(fit, flat, atol=1e-12)
+
+
+def test_defaults_are_plain_toml():
+    assert Scenario.parse(tomllib.loads(Scenario().template()), where="here") == Scenario()
