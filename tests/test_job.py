@@ -1,0 +1,120 @@
+"""The main job on a tiny scenario, done once as a user does it, and what it leaves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from tests.command_line import only_line, pdvc_bench
+
+TINY = """
+name = "tiny"
+title = "Small enough for a test"
+discarded_rows = 12
+
+[graphite]
+mean_diameter_mm = 0.25
+smallest_diameter_mm = 0.1
+largest_diameter_mm = 0.5
+gap_mm = 0.016
+
+[geometry]
+pixel_mm = 2.3968
+rows = 119
+columns = 54
+
+[acquisition]
+reference_views = 60
+test_steps = 25
+steps_per_turn = 10
+subpixels = 2
+
+[loading]
+plateau_steps = 10
+stroke_mm_per_s = 0.01
+"""
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory):
+    """Do the main job once; the tests below look at what it left."""
+    folder = tmp_path_factory.mktemp("job")
+    scenario = folder / "tiny.toml"
+    scenario.write_text(TINY)
+    result = pdvc_bench("run", scenario, "-o", folder / "out", "--threads", 1)
+    assert result.exit_code == 0, result.stderr
+    return folder, result
+
+
+def test_the_job_writes_all_it_promises(job):
+    folder, result = job
+    out = folder / "out"
+    assert str(out / "report.html") in result.stderr
+    assert "error across beam" in result.stdout
+    for name in ("experiment/experiment.toml", "measurement.nc", "scores.json", "report.html"):
+        assert (out / name).is_file()
+    assert len(list((out / "figures").glob("*.png"))) == 10
+    assert not list(out.rglob("*.partial"))
+
+
+def test_scores_are_complete_and_plausible(job):
+    folder, _ = job
+    values = json.loads((folder / "out" / "scores.json").read_text())
+    assert values["scenario"] == "tiny"
+    assert values["steps"] == 25
+    assert values["peak_memory_gib"] > 0
+    assert min(values["seconds"].values()) > 0
+    assert values["snr_db"]["final"] > values["snr_db"]["initial"]
+    assert values["error_voxel"]["across_beam"] < 0.3
+
+
+def test_asked_again_the_job_repeats_only_scores_and_report(job):
+    folder, _ = job
+    out = folder / "out"
+    kept = [out / "measurement.nc", out / "experiment" / "experiment.toml"]
+    before = [path.stat().st_mtime_ns for path in kept]
+    scores = (out / "scores.json").read_text()
+    (out / "report.html").unlink()
+    result = pdvc_bench("run", folder / "tiny.toml", "-o", out, "--threads", 1)
+    assert result.exit_code == 0, result.stderr
+    assert "experiment: finished before, kept" in result.stderr
+    assert "measurement: finished before, kept" in result.stderr
+    assert [path.stat().st_mtime_ns for path in kept] == before
+    assert (out / "scores.json").read_text() == scores
+    assert (out / "report.html").is_file()
+
+
+def test_another_scenario_does_not_overwrite_a_job(job):
+    folder, _ = job
+    other = folder / "other.toml"
+    other.write_text(TINY.replace("reference_views = 60", "reference_views = 61"))
+    result = pdvc_bench("run", other, "-o", folder / "out")
+    assert result.exit_code == 2
+    assert "acquisition.reference_views differs" in only_line(result)
+
+
+def test_score_and_report_alone_agree_with_the_run(job):
+    folder, _ = job
+    out = folder / "out"
+    arguments = (out / "measurement.nc", "--truth", out / "experiment")
+    alone = json.loads(pdvc_bench("score", *arguments).stdout)
+    together = json.loads((out / "scores.json").read_text())
+    for key in ("error_voxel", "bias_voxel", "random_voxel", "strain_rms", "snr_db", "modes"):
+        assert alone[key] == together[key]
+    result = pdvc_bench("report", *arguments, "-o", folder / "page")
+    assert result.exit_code == 0, result.stderr
+    assert len(list((folder / "page" / "figures").glob("*.png"))) == 10
+
+
+def test_a_truncated_stack_is_named(job):
+    folder, _ = job
+    copy = folder / "copy"
+    shutil.copytree(folder / "out" / "experiment", copy)
+    with (copy / "test" / "radiographs.tif").open("r+b") as file:
+        file.truncate(10_000)
+    result = pdvc_bench("measure", copy, "-o", folder / "never.nc")
+    assert result.exit_code == 2
+    assert str(copy / "test" / "radiographs.tif") in only_line(result)
+    assert not (folder / "never.nc").exists()
