@@ -1,0 +1,305 @@
+"""The kernels against closed forms, finite differences, and a projector written anew in numpy."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from pdvc.projection import normal_equations, project
+from pdvc.sections import CONTRACTION, RIGID, SectionBasis
+from pdvc.volume import Grid, Volume
+from tests.small_case import (
+    ONE,
+    SCANNER,
+    SECTIONS,
+    SHAPE,
+    VOXEL_MM,
+    hull_around,
+    motion,
+    rays_at,
+    stored,
+    textured,
+    volume_of,
+)
+
+BLANK = np.zeros(SHAPE, dtype=np.float32)
+EVEN = np.ones(SHAPE, dtype=np.float32)
+BLOB_CENTRE = np.array([0.11, -0.07, 0.05])
+BLOB_SHAPE = np.array([[40.0, 9.0, 0.0], [9.0, 70.0, -12.0], [0.0, -12.0, 30.0]])
+"""Inverse covariance of the blob, 1 / mm^2."""
+
+
+def blob(voxel_mm):
+    """Return a volume of F(x) = exp(-(x - c)^T A (x - c) / 2), reaching to where it is below single precision."""
+    count = np.round(np.array([2.2, 1.5, 1.8]) / voxel_mm).astype(int)
+    grid = Grid(
+        shape=tuple(int(n) for n in count),
+        voxel_mm=voxel_mm,
+        origin_mm=tuple(float(-(n - 1) / 2 * voxel_mm) for n in count[::-1]),
+    )
+    z, y, x = np.meshgrid(
+        *(o + voxel_mm * np.arange(n) for o, n in zip(grid.origin_mm[::-1], count, strict=True)), indexing="ij"
+    )
+    away = np.stack([x, y, z], axis=-1) - BLOB_CENTRE
+    values = np.exp(-0.5 * np.einsum("...a,ab,...b->...", away, BLOB_SHAPE, away)).astype(np.float32)
+    for axis in range(3):
+        np.moveaxis(values, axis, 0)[[0, -1]] = 0
+    return Volume(values=values, grid=grid, hull=hull_around(values, grid))
+
+
+def blob_integrals(rays, shift_mm=(0.0, 0.0, 0.0)):
+    """Return the exact line integrals (row, column) of the blob, moved by a shift."""
+    row, column = np.indices(SHAPE)
+    d = rays[1] + row[..., None] * rays[2] + column[..., None] * rays[3] - rays[0]
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    p = rays[0] - BLOB_CENTRE - np.asarray(shift_mm)
+    dd = np.einsum("...a,ab,...b->...", d, BLOB_SHAPE, d)
+    pd = np.einsum("a,ab,...b->...", p, BLOB_SHAPE, d)
+    return np.sqrt(2 * np.pi / dd) * np.exp(-0.5 * (p @ BLOB_SHAPE @ p - pd**2 / dd))
+
+
+def still(basis=ONE):
+    return np.zeros(basis.shape)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.8, 4.0])
+def test_line_integrals_converge_to_the_closed_form_with_the_square_of_the_voxel(angle):
+    rays = rays_at(angle)
+    exact = blob_integrals(rays)
+    sizes = (0.06, 0.03, 0.015)
+    errors = [
+        np.sqrt(np.mean((project(blob(h), rays, SHAPE, ONE, still(), voxel_mm=VOXEL_MM) - exact) ** 2)) / exact.max()
+        for h in sizes
+    ]
+    rates = -np.diff(np.log2(errors))
+    np.testing.assert_allclose(rates, 2, atol=0.15)
+    assert errors[-1] < 3e-4
+
+
+def test_a_translated_blob_is_where_the_translation_takes_it():
+    rays = rays_at(1.3)
+    amplitude = still()
+    amplitude[0, :3] = [2.3, -1.7, 3.1]
+    moved = project(blob(0.025), rays, SHAPE, ONE, amplitude, voxel_mm=VOXEL_MM)
+    exact = blob_integrals(rays, VOXEL_MM * amplitude[0, :3])
+    # the same error as that of the still blob: 0.05 voxel more would double it
+    assert np.sqrt(np.mean((moved - exact) ** 2)) < 7e-4 * exact.max()
+
+
+def test_a_finer_step_along_the_ray_changes_little_and_less_the_finer():
+    rays = rays_at(0.4)
+    finest, fine, coarse = (
+        project(textured(), rays, SHAPE, SECTIONS, motion(SECTIONS), voxel_mm=VOXEL_MM, step=step)
+        for step in (0.125, 0.5, 1.0)
+    )
+    coarse_error, fine_error = np.std(coarse - finest), np.std(fine - finest)
+    assert fine_error < coarse_error / 2
+    assert coarse_error < 0.02 * finest.max()
+
+
+@pytest.mark.parametrize("basis", [ONE, SECTIONS], ids=["one", "sections"])
+def test_the_projection_is_the_residual_against_a_blank_radiograph(basis):
+    rays, amplitude = rays_at(2.0), motion(basis)
+    alone = project(textured(), rays, SHAPE, basis, amplitude, voxel_mm=VOXEL_MM)
+    whole = normal_equations(textured(), rays, basis, amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM)
+    np.testing.assert_allclose(alone, whole.residual, atol=2e-6 * alone.max())
+    assert whole.chi2 == pytest.approx((alone.astype(float) ** 2).sum(), rel=1e-6)
+
+
+WITH_CONTRACTION = SectionBasis(
+    height_mm=SECTIONS.height_mm, radius_mm=SECTIONS.radius_mm, motions=(*RIGID, CONTRACTION)
+)
+
+
+@pytest.mark.parametrize("basis", [ONE, SECTIONS, WITH_CONTRACTION], ids=["one", "sections", "contraction"])
+@pytest.mark.parametrize(("angle", "step"), [(0.0, 1.0), (2.5, 1.0), (5.0, 0.7)])
+def test_normal_equations_agree_with_stored_sensitivities(basis, angle, step):
+    rays, amplitude = rays_at(angle), motion(basis, seed=3)
+    rng = np.random.default_rng(4)
+    target = rng.normal(size=SHAPE).astype(np.float32)
+    weight = rng.uniform(0, 2, size=SHAPE).astype(np.float32)
+    found = normal_equations(textured(), rays, basis, amplitude, target, weight, voxel_mm=VOXEL_MM, step=step)
+    value, s = stored(textured(), rays, SHAPE, basis, amplitude, VOXEL_MM, step)
+    rho, w = value - target.ravel(), weight.ravel()
+    np.testing.assert_allclose(found.residual.ravel(), rho, atol=1e-5 * value.max())
+    expected = s.T @ (w[:, None] * s)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(found.matrix / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-4)
+    np.testing.assert_allclose(found.vector / scale, s.T @ (w * rho) / scale, atol=1e-4 * np.sqrt((w * rho**2).sum()))
+    assert found.chi2 == pytest.approx((w * rho**2).sum(), rel=1e-5)
+
+
+def test_amplitudes_are_counted_in_the_voxel_that_is_named_whatever_the_volume_s():
+    rays, amplitude = rays_at(1.0), motion(SECTIONS)
+    fine = normal_equations(textured(), rays, SECTIONS, amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM)
+    half = normal_equations(textured(), rays, SECTIONS, 2 * amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM / 2)
+    np.testing.assert_array_equal(half.residual, fine.residual)
+    np.testing.assert_allclose(half.vector, fine.vector / 2, rtol=1e-9)
+    np.testing.assert_allclose(half.matrix, fine.matrix / 4, rtol=1e-9, atol=1e-12)
+
+
+def smooth(seed):
+    field = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=SHAPE), 3)
+    return (field / field.std()).astype(np.float32)
+
+
+CASES = [
+    *[(ONE, 0, k) for k in range(6)],
+    *[(SECTIONS, j, k) for j, k in ((0, 0), (0, 4), (1, 2), (1, 5), (2, 1), (2, 3), (3, 2), (3, 4))],
+    *[(WITH_CONTRACTION, j, 6) for j in (1, 2)],
+]
+
+
+@pytest.mark.parametrize(("basis", "section", "kind"), CASES)
+def test_sensitivities_are_the_slope_of_the_projection(basis, section, kind):
+    """c = S^T rho with rho given, against central differences: S = -dP/da.
+
+    With a fine step along the ray, as its points move a little when the sample does.
+    """
+    rays, amplitude, rho = rays_at(0.9), motion(basis, seed=5), smooth(6)
+
+    def projected(change):
+        trial = amplitude.copy()
+        trial[section, kind] += change
+        return project(textured(3.0), rays, SHAPE, basis, trial, voxel_mm=VOXEL_MM, step=0.1)
+
+    target = projected(0) - rho
+    found = normal_equations(textured(3.0), rays, basis, amplitude, target, EVEN, voxel_mm=VOXEL_MM, step=0.1)
+    change = 0.02
+    slope = (projected(-change).astype(float) - projected(change)) / (2 * change)
+    expected = (slope * rho).sum()
+    norm = np.sqrt((slope**2).sum() * (rho.astype(float) ** 2).sum())
+    at = section * basis.shape[1] + kind
+    assert found.vector[at] == pytest.approx(expected, abs=1e-3 * norm)
+    assert np.sqrt(found.matrix[at, at]) == pytest.approx(np.sqrt((slope**2).sum()), rel=3e-3)
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.tuples(*[st.integers(-3, 3)] * 3), st.floats(-3, 3))
+def test_a_translation_by_whole_voxels_is_the_volume_shifted(shift, angle):
+    values = np.pad(textured().values, 4)
+    moved = np.roll(values, shift, axis=(2, 1, 0))
+    amplitude = still(SECTIONS)
+    amplitude[:, :3] = shift
+    rays = rays_at(angle)
+    # a fine step, as the points along a ray lie elsewhere
+    warped = project(volume_of(values), rays, SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM, step=0.05)
+    shifted = project(volume_of(moved), rays, SHAPE, SECTIONS, still(SECTIONS), voxel_mm=VOXEL_MM, step=0.05)
+    np.testing.assert_allclose(warped, shifted, atol=2e-4 * shifted.max())
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(1, 6), st.integers(0, 1000), st.floats(-3, 3))
+def test_the_number_of_sections_does_not_change_the_same_rigid_motion(sections, seed, angle):
+    basis = SectionBasis(height_mm=np.linspace(-1.1, 1.2, sections), radius_mm=0.3)
+    amplitude = motion(ONE, seed)
+    one = project(textured(), rays_at(angle), SHAPE, ONE, amplitude, voxel_mm=VOXEL_MM)
+    many = project(textured(), rays_at(angle), SHAPE, basis, basis.rigid(amplitude, ONE), voxel_mm=VOXEL_MM)
+    np.testing.assert_allclose(many, one, atol=2e-5 * one.max())
+
+
+def test_a_pixel_of_no_weight_counts_for_nothing():
+    rays, amplitude, target = rays_at(0.2), motion(SECTIONS), smooth(1)
+    weight = (smooth(2) > 0).astype(np.float32)
+    other = np.where(weight > 0, target, 1e3 * smooth(3)).astype(np.float32)
+    one, two = (
+        normal_equations(textured(), rays, SECTIONS, amplitude, g, weight, voxel_mm=VOXEL_MM) for g in (target, other)
+    )
+    np.testing.assert_array_equal(one.matrix, two.matrix)
+    np.testing.assert_array_equal(one.vector, two.vector)
+    assert one.chi2 == two.chi2
+    assert (one.residual != two.residual).any()
+
+
+def test_a_window_without_any_weight_gives_empty_equations():
+    found = normal_equations(textured(), rays_at(0.2), SECTIONS, still(SECTIONS), BLANK, BLANK, voxel_mm=VOXEL_MM)
+    assert not found.matrix.any()
+    assert not found.vector.any()
+    assert found.chi2 == 0
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+def test_one_and_two_threads_give_the_same_bits():
+    results = []
+    before = numba.get_num_threads()
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(threads)
+            results.append(
+                normal_equations(
+                    textured(), rays_at(0.7), SECTIONS, motion(SECTIONS), smooth(1), EVEN, voxel_mm=VOXEL_MM
+                )
+            )
+    finally:
+        numba.set_num_threads(before)
+    one, two = results
+    np.testing.assert_array_equal(one.matrix, two.matrix)
+    np.testing.assert_array_equal(one.vector, two.vector)
+    np.testing.assert_array_equal(one.residual, two.residual)
+    assert one.chi2 == two.chi2
+
+
+@pytest.mark.parametrize("kind", ["translation_x", "translation_y", "translation_z"])
+def test_a_sample_moved_out_of_sight_leaves_air(kind):
+    amplitude = still(SECTIONS)
+    amplitude[:, RIGID.index(kind)] = 300
+    # along the beam, 15 mm stay on the screen: then look across
+    rays = rays_at(np.pi / 2 if kind == "translation_x" else 0.0)
+    found = normal_equations(textured(), rays, SECTIONS, amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM)
+    assert not found.residual.any()
+    assert not found.matrix.any()
+
+
+def test_a_sample_of_which_half_has_left_the_window_is_still_projected_rightly():
+    amplitude = motion(SECTIONS)
+    amplitude[:, 2] += 25
+    rays = rays_at(0.3)
+    found = normal_equations(textured(), rays, SECTIONS, amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM)
+    value, s = stored(textured(), rays, SHAPE, SECTIONS, amplitude, VOXEL_MM)
+    assert (value == 0).mean() > 0.4
+    np.testing.assert_allclose(found.residual.ravel(), value, atol=1e-5 * value.max())
+    np.testing.assert_allclose(found.matrix, s.T @ s, atol=1e-4 * np.diag(s.T @ s).max())
+
+
+def test_a_long_window_is_the_sum_of_its_parts():
+    """Bands of rows see other sections; their equations add up wherever the cuts lie."""
+    amplitude, target = motion(SECTIONS), smooth(8)
+    cuts = [0, 5, 22, 39, SCANNER.rows]
+    whole = normal_equations(textured(), rays_at(1.1), SECTIONS, amplitude, target, EVEN, voxel_mm=VOXEL_MM)
+    parts = [
+        normal_equations(
+            textured(),
+            rays_at(1.1, SCANNER.cropped(first, last, 0, SCANNER.columns)),
+            SECTIONS,
+            amplitude,
+            target[first:last],
+            EVEN[first:last],
+            voxel_mm=VOXEL_MM,
+        )
+        for first, last in pairwise(cuts)
+    ]
+    np.testing.assert_allclose(np.concatenate([part.residual for part in parts]), whole.residual, atol=1e-5)
+    np.testing.assert_allclose(sum(part.matrix for part in parts), whole.matrix, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_amplitudes_that_are_no_numbers_are_refused(bad):
+    amplitude = still(SECTIONS)
+    amplitude[1, 1] = bad
+    with pytest.raises(ValueError, match=r"amplitude: expected finite \(4, 6\)"):
+        project(textured(), rays_at(0.0), SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM)
+
+
+def test_amplitudes_of_another_basis_are_refused():
+    with pytest.raises(ValueError, match=r"amplitude: expected finite \(4, 6\), got \(1, 6\)"):
+        project(textured(), rays_at(0.0), SHAPE, SECTIONS, still(ONE), voxel_mm=VOXEL_MM)
+
+
+def test_a_volume_of_another_type_is_refused():
+    with pytest.raises(ValueError, match="volume: expected float32"):
+        replace(textured(), values=textured().values.astype(float))
