@@ -118,3 +118,24 @@ def test_a_truncated_stack_is_named(job):
     assert result.exit_code == 2
     assert str(copy / "test" / "radiographs.tif") in only_line(result)
     assert not (folder / "never.nc").exists()
+
+
+def test_an_interrupted_job_says_so_and_goes_on_to_the_same_counts(job, monkeypatch):
+    folder, _ = job
+    out = folder / "interrupted"
+
+    def press_ctrl_c(_, task, done, total):
+        if task == "test" and done == 7:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("validation.console.ProgressBars.__call__", press_ctrl_c)
+        result = pdvc_bench("run", folder / "tiny.toml", "-o", out, "--threads", 1)
+    assert result.exit_code == 130
+    assert only_line(result) == "interrupted; give the same command again to go on from here"
+    assert not (out / "experiment" / "experiment.toml").exists()
+    result = pdvc_bench("simulate", folder / "tiny.toml", "-o", out / "experiment")
+    assert result.exit_code == 0, result.stderr
+    for name in ("reference/radiographs.tif", "test/radiographs.tif", "flats.tif", "darks.tif", "experiment.toml"):
+        expected = (folder / "out" / "experiment" / name).read_bytes()
+        assert (out / "experiment" / name).read_bytes() == expected, name

@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,7 +64,7 @@ class State:
     """Hold what earlier attempts did in a folder, so that the next one knows what still holds."""
 
     measurement: str = ""
-    """Fingerprint of the experiment and options that measurement.nc belongs to."""
+    """Fingerprint of the software's version, options and experiment that measurement.nc belongs to."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent so far, s, all attempts together."""
     peak_memory_gib: float = 0.0
@@ -143,7 +144,7 @@ def _measure(
     job: Job, state: State, state_path: Path, experiment: Experiment, progress: Progress
 ) -> tuple[Measurement, bool]:
     """Measure unless that is done with the same options; returns the measurement and whether it was."""
-    wanted = fingerprint(job.options.template(), *_file_stamps(job.experiment))
+    wanted = fingerprint(version("pdvc-bench"), job.options.template(), *_file_stamps(job.experiment))
     if job.measurement.exists() and state.measurement == wanted:
         return read_measurement(job.measurement), True
     from pdvc.measure import measure
