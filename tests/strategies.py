@@ -79,6 +79,7 @@ def descriptions(draw: st.DrawFn) -> Description:
         test=stack(),
     )
 
+
 finite = st.floats(-1.0, 1.0, allow_nan=False)
 
 
