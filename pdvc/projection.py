@@ -40,6 +40,8 @@ BAND_ROWS = 16
 _f = np.float32
 _BIG = 1e30
 _NORMALS = Hull.normals()
+_NORMALS32 = np.ascontiguousarray(_NORMALS.T, dtype=np.float32)
+_NOWHERE = np.float32(-1e6)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,13 +166,13 @@ def _indexed(affine: Floats, origin_mm: Floats, voxel_mm: float) -> Floats:
     return result
 
 
-def _hull_in_index(volume: Volume) -> tuple[Floats, Floats]:
-    """Return (bottom, height) of the hull's slabs and its supports, in voxel indices."""
+def _hull_in_index(volume: Volume) -> tuple[Floats, Image]:
+    """Return (bottom, height) of the hull's slabs and its supports, in voxel indices; empty slabs far outside."""
     grid, hull = volume.grid, volume.hull
     origin = np.array(grid.origin_mm)
     place = np.array([(hull.z_mm - origin[2]) / grid.voxel_mm, hull.slab_mm / grid.voxel_mm])
     support = (hull.support_mm - _NORMALS @ origin[:2]) / grid.voxel_mm
-    return place, support
+    return place, np.where(np.isfinite(support), support, _NOWHERE).astype(np.float32)
 
 
 def _moved_box(volume: Volume, heights: Floats, maps: Floats) -> Floats:
@@ -218,7 +220,7 @@ def _band_sections(
     return low, int((high - low).max()) + 1
 
 
-@njit(nogil=True, cache=True, fastmath=True, boundscheck=False)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
 def _sum_all(volume, stride_y, stride_z, limit, first, last, step, path):  # type: ignore[no-untyped-def]
     """Sum F, and grad F times 1, l, l^2, at l = (m + 1/2) step, first <= m < last; path = x'(l)."""
     ax, bx, cx, ay, by, cy, az, bz, cz = path
@@ -260,7 +262,7 @@ def _sum_all(volume, stride_y, stride_z, limit, first, last, step, path):  # typ
     return v0, g0, g1, g2, h0, h1, h2, k0, k1, k2
 
 
-@njit(nogil=True, cache=True, fastmath=True, boundscheck=False)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
 def _sum_values(volume, stride_y, stride_z, limit, first, last, step, path):  # type: ignore[no-untyped-def]
     """Sum F at l = (m + 1/2) step, first <= m < last; path = x'(l)."""
     ax, bx, cx, ay, by, cy, az, bz, cz = path
@@ -285,7 +287,7 @@ def _sum_values(volume, stride_y, stride_z, limit, first, last, step, path):  # 
     return v0
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _clip_box(box, base, along):  # type: ignore[no-untyped-def]
     """Return the part [a, b] of the ray base + l along that lies in a box; empty where a >= b."""
     a, b = -_BIG, _BIG
@@ -299,33 +301,38 @@ def _clip_box(box, base, along):  # type: ignore[no-untyped-def]
     return a, b
 
 
-@njit(nogil=True, cache=True)
-def _clip_hull(place, support, normals, a, b, path):  # type: ignore[no-untyped-def]
-    """Shrink [a, b] to where the moved ray x'(l), taken as straight between a and b, meets the hull."""
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
+def _clip_hull(place, support, normals, limit, a, b, path):  # type: ignore[no-untyped-def]
+    """Shrink [a, b] to where the moved ray x'(l), taken as straight between a and b, meets the hull.
+
+    Written without branches over the half-planes, in single precision, so that they are clipped together;
+    `limit` (direction,) is scratch.
+    """
     ax, bx, cx, ay, by, cy, az, bz, cz = path
-    xa, ya, za = ax + a * (bx + a * cx), ay + a * (by + a * cy), az + a * (bz + a * cz)
-    xb, yb, zb = ax + b * (bx + b * cx), ay + b * (by + b * cy), az + b * (bz + b * cz)
+    xa, ya, za = _f(ax + a * (bx + a * cx)), _f(ay + a * (by + a * cy)), az + a * (bz + a * cz)
+    xb, yb, zb = _f(ax + b * (bx + b * cx)), _f(ay + b * (by + b * cy)), az + b * (bz + b * cz)
     first = max(int(np.floor((min(za, zb) - place[0]) / place[1])), 0)
     last = min(int(np.floor((max(za, zb) - place[0]) / place[1])), support.shape[0] - 1)
-    low, high = 0.0, 1.0
-    for k in range(normals.shape[0]):
-        limit = -np.inf
-        for slab in range(first, last + 1):
-            limit = max(limit, support[slab, k])
-        if limit == -np.inf:
-            return a, a
-        da = limit - (normals[k, 0] * xa + normals[k, 1] * ya)
-        db = limit - (normals[k, 0] * xb + normals[k, 1] * yb)
-        if da < 0 and db < 0:
-            return a, a
-        if da < 0:
-            low = max(low, da / (da - db))
-        elif db < 0:
-            high = min(high, da / (da - db))
+    if first > last:
+        return a, a
+    limit[:] = support[first]
+    for slab in range(first + 1, last + 1):
+        for k in range(len(limit)):
+            limit[k] = max(limit[k], support[slab, k])
+    low, high = _f(0), _f(1)
+    for k in range(len(limit)):
+        da = limit[k] - (normals[0, k] * xa + normals[1, k] * ya)
+        db = limit[k] - (normals[0, k] * xb + normals[1, k] * yb)
+        t = da / (da - db)
+        enter = _f(2) if db < 0 else t
+        low = max(low, enter if da < 0 else _f(0))
+        high = min(high, t if db < 0 else _f(1))
+    if low >= high:
+        return a, a
     return a + low * (b - a), a + high * (b - a)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _quadratic_row(first, second, i, base, along, s0, s1):  # type: ignore[no-untyped-def]
     """Return coordinate i of x'(l) = x - u(x), with u = (1 - s) u_first + s u_second, s = s0 + s1 l."""
     p = first[i, 0] * base[0] + first[i, 1] * base[1] + first[i, 2] * base[2] + first[i, 3]
@@ -335,7 +342,7 @@ def _quadratic_row(first, second, i, base, along, s0, s1):  # type: ignore[no-un
     return base[i] - p - s0 * dp, along[i] - q - s0 * dq - s1 * dp, -s1 * dq
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _quadratic(first, second, base, along, s0, s1):  # type: ignore[no-untyped-def]
     """Return the nine coefficients of the moved ray x'(l), coordinate by coordinate."""
     ax, bx, cx = _quadratic_row(first, second, 0, base, along, s0, s1)
@@ -344,7 +351,7 @@ def _quadratic(first, second, base, along, s0, s1):  # type: ignore[no-untyped-d
     return ax, bx, cx, ay, by, cy, az, bz, cz
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
 def _add_section(pattern, w0, w1, base, along, sums, scale, k, out):  # type: ignore[no-untyped-def]
     """Add to `out` (motion,) the integral of (w0 + w1 l) Psi(x(l)) . grad F, from the nine sums; `k` is scratch."""
     for i in range(3):
@@ -360,7 +367,7 @@ def _add_section(pattern, w0, w1, base, along, sums, scale, k, out):  # type: ig
         out[n] += total
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
 def _add_outer(matrix, vector, s, first, last, weight, rho):  # type: ignore[no-untyped-def]
     """Add w s s^T (lower triangle) and w s rho of one pixel."""
     for i in range(first, last):
@@ -370,7 +377,7 @@ def _add_outer(matrix, vector, s, first, last, weight, rho):  # type: ignore[no-
             matrix[i, j] += w * s[j]
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 def _walk_bands(  # type: ignore[no-untyped-def]
     volume,
     shape,
@@ -418,7 +425,7 @@ def _walk_bands(  # type: ignore[no-untyped-def]
         )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 def _walk_band(  # type: ignore[no-untyped-def]
     volume,
     shape,
@@ -448,7 +455,7 @@ def _walk_band(  # type: ignore[no-untyped-def]
     limit = (_f(shape[2] - 1.0001), _f(shape[1] - 1.0001), _f(shape[0] - 1.0001))
     step32 = _f(step)
     scale = step * voxel_mm
-    normals = _NORMALS
+    normals, limit16 = _NORMALS32, np.empty(_NORMALS32.shape[1], np.float32)
     s = np.zeros(max(vector.shape[0], 1))
     base, along, k12 = np.empty(3), np.empty(3), np.empty(12)
     middle = 0.5 * (box[0] + box[1])
@@ -487,7 +494,7 @@ def _walk_band(  # type: ignore[no-untyped-def]
                 else:
                     j1 = j0
                 path = _quadratic(maps[j0], maps[j1], base, along, s0, s1)
-                inner_a, inner_b = _clip_hull(place, support, normals, a, b, path)
+                inner_a, inner_b = _clip_hull(place, support, normals, limit16, a, b, path)
                 if inner_a < inner_b:
                     # points m + 1/2 are shared out so that each belongs to one interval
                     first = int(np.ceil(inner_a / step - 0.5))

@@ -149,13 +149,13 @@ def _columns_inside(grid: Grid, hull: Hull) -> tuple[NDArray[np.bool_], NDArray[
     return inside, first
 
 
-@njit(nogil=True, cache=True, fastmath=True, boundscheck=False)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
 def _blend(one, two, f, first, last, out):  # type: ignore[no-untyped-def]
     for r in range(first, last):
         out[r] = one[r] + f * (two[r] - one[r])
 
 
-@njit(nogil=True, cache=True, fastmath=True, boundscheck=False)
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
 def _add_slab(out, line, first, last, r0, dr, top, weight):  # type: ignore[no-untyped-def]
     for k in range(first, last):
         r = min(max(r0 + np.float32(k) * dr, np.float32(0)), top)
@@ -164,7 +164,7 @@ def _add_slab(out, line, first, last, r0, dr, top, weight):  # type: ignore[no-u
         out[k] += weight * (low + (r - np.float32(i)) * (line[i + np.uint32(1)] - low))
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 def _back_project(out, views, beam, across, origin, voxel, distances, shift, inside, first):  # type: ignore[no-untyped-def]
     """Add a batch of filtered views (view, column, row) to the volume (y, x, z)."""
     ny, nx = out.shape[:2]

@@ -88,7 +88,7 @@ class Systematic:
         return result
 
 
-@njit(nogil=True, cache=True, parallel=True)
+@njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 def _register(field, rays, heights, maps, corner, out):  # type: ignore[no-untyped-def]
     """Sample `field` where each pixel's material was before it moved; zero outside."""
     n = len(heights)
