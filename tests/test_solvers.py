@@ -1,0 +1,455 @@
+"""PGD, Gauss-Newton and the posterior: brute force on small systems, Monte Carlo, and the inverse crime on purpose.
+
+Radiographs made with pdvc's own projector must give the motion back almost exactly; what is left with simulated
+radiographs is then the error of the model, not of the solvers.
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdvc import gauss_newton, pgd
+from pdvc.equations import Equations, linearise, residuals
+from pdvc.prior import Prior
+from pdvc.sections import SectionBasis
+from pdvc.systematic import Systematic
+from pdvc.uncertainty import posterior
+from tests.small_case import (
+    SECTIONS,
+    SHAPE,
+    STEPS,
+    VOXEL_MM,
+    lineariser,
+    radiographs,
+    time_functions,
+)
+
+FUNCTIONS = 4
+UNKNOWNS = SECTIONS.shape[0] * SECTIONS.shape[1]
+ZERO = np.zeros((FUNCTIONS, *SECTIONS.shape))
+ONE_PASS = {"passes_per_mode": 1}
+"""As in the paper."""
+
+
+def prior(deviation=1e3, shape=SECTIONS.shape):
+    return Prior(deviation_voxel=np.full(shape, deviation))
+
+
+def random_equations(seed, *, steps=9, shape=(2, 3), pixels=50):
+    """Return equations with full B(t), from random sensitivities and residuals, and no image behind them."""
+    rng = np.random.default_rng(seed)
+    size = shape[0] * shape[1]
+    s, rho = rng.normal(size=(steps, pixels, size)), rng.normal(size=(steps, pixels))
+    return Equations(
+        matrix=np.einsum("tri,trj->tij", s, s),
+        vector=np.einsum("tri,tr->ti", s, rho),
+        chi2=(rho**2).sum(axis=1),
+        residual=rho[:, :, None].astype(np.float32),
+        pixels=steps * pixels,
+    )
+
+
+def random_functions(seed, *, functions=3, steps=9):
+    q = np.linalg.qr(np.random.default_rng(seed + 1000).normal(size=(steps, functions)))[0]
+    return q.T * np.sqrt(steps)
+
+
+def linear_model(start, functions, shape):
+    """Return a linear problem's equations at any amplitudes, from those at zero: S does not change."""
+
+    def at(amplitude):
+        a = amplitude.reshape(len(amplitude), -1)
+        bent = np.einsum("tij,tj->ti", start.matrix, a)
+        chi2 = start.chi2 - 2 * (a * start.vector).sum(axis=1) + (a * bent).sum(axis=1)
+        return replace(start, vector=start.vector - bent, chi2=chi2)
+
+    return at
+
+
+def chi2_of(equations, functions, coefficients):
+    """Return chi2 of the linear model at coefficients (function, unknown), straight from its definition."""
+    a = coefficients.T @ functions
+    return sum(
+        equations.chi2[t] - 2 * a[:, t] @ equations.vector[t] + a[:, t] @ equations.matrix[t] @ a[:, t]
+        for t in range(functions.shape[1])
+    )
+
+
+# Equations and Hessian by brute force
+
+
+@given(st.integers(0, 10**6))
+@settings(deadline=None, max_examples=20)
+def test_the_hessian_is_the_sum_of_kronecker_products(seed):
+    equations, functions = random_equations(seed), random_functions(seed)
+    expected = sum(
+        np.kron(np.outer(functions[:, t], functions[:, t]), equations.matrix[t]) for t in range(functions.shape[1])
+    )
+    np.testing.assert_allclose(gauss_newton.hessian(equations, functions), expected, rtol=1e-10, atol=1e-8)
+
+
+@given(st.integers(0, 10**6), st.floats(0.05, 10.0))
+@settings(deadline=None, max_examples=20)
+def test_a_mode_fulfils_equations_12_to_17_with_the_prior_s_terms(seed, deviation):
+    """Neither b at given a, nor a at given b, can lower chi2 + prior: written out element by element."""
+    equations, functions = random_equations(seed), random_functions(seed)
+    before = np.random.default_rng(seed).normal(scale=0.1, size=(3, 6))
+    a, b = pgd.find_mode(equations, functions, before, prior(deviation, (2, 3)))
+    ridge = equations.rms**2 / deviation**2
+    alpha = a @ functions
+    n_matrix = sum(alpha[t] ** 2 * equations.matrix[t] for t in range(9)) + ridge * (a @ a) * np.eye(6)
+    n_vector = sum(alpha[t] * equations.vector[t] for t in range(9)) - ridge * (a @ before)
+    m_matrix, m_vector = np.zeros((3, 3)), np.zeros(3)
+    for i in range(3):
+        m_vector[i] = sum(functions[i, t] * (b @ equations.vector[t]) for t in range(9)) - ridge * before[i] @ b
+        for j in range(3):
+            m_matrix[i, j] = sum(functions[i, t] * functions[j, t] * b @ equations.matrix[t] @ b for t in range(9))
+    m_matrix += ridge * (b @ b) * np.eye(3)
+    assert np.linalg.norm(a) == pytest.approx(1)
+    tolerance = 1e-3 * np.linalg.norm(b)
+    np.testing.assert_allclose(np.linalg.solve(n_matrix, n_vector), b, atol=tolerance)
+    np.testing.assert_allclose(np.linalg.solve(m_matrix, m_vector), a, atol=1e-3)
+
+
+def test_a_mode_s_value_is_no_worse_than_that_of_any_random_start():
+    equations, functions = random_equations(7), random_functions(7)
+    zero = np.zeros((3, 6))
+    found = chi2_of(equations, functions, np.outer(*pgd.find_mode(equations, functions, zero, prior(1e4, (2, 3)))))
+    rng = np.random.default_rng(8)
+    for _ in range(50):
+        a = rng.normal(size=3)
+        alpha = a @ functions
+        b = np.linalg.solve(np.tensordot(alpha**2, equations.matrix, axes=1), alpha @ equations.vector)
+        assert found <= chi2_of(equations, functions, np.outer(a, b)) + 1e-9
+
+
+def test_gauss_newton_solves_a_linear_problem_in_one_pass():
+    equations, functions = random_equations(3), random_functions(3)
+    found = gauss_newton.solve(
+        linear_model(equations, functions, (2, 3)),
+        functions,
+        np.zeros((3, 2, 3)),
+        prior(1e6, (2, 3)),
+        most_passes=5,
+        least_change_voxel=1e-9,
+    )
+    hessian = sum(np.kron(np.outer(functions[:, t], functions[:, t]), equations.matrix[t]) for t in range(9))
+    vector = sum(np.kron(functions[:, t], equations.vector[t]) for t in range(9))
+    np.testing.assert_allclose(found.coefficients.ravel(), np.linalg.solve(hessian, vector), rtol=1e-6, atol=1e-9)
+
+
+def test_pgd_comes_to_gauss_newton_s_solution_with_enough_modes():
+    equations, functions = random_equations(4), random_functions(4)
+    model, start, believed = linear_model(equations, functions, (2, 3)), np.zeros((3, 2, 3)), prior(1e6, (2, 3))
+    direct = gauss_newton.solve(model, functions, start, believed, most_passes=5, least_change_voxel=1e-9)
+    greedy = pgd.solve(model, functions, start, believed, most_modes=300, least_gain=0.0, noise_rms=None, **ONE_PASS)
+    np.testing.assert_allclose(greedy.coefficients, direct.coefficients, atol=1e-4)
+
+
+# Prior and posterior
+
+
+@pytest.mark.parametrize("solver", ["pgd", "gauss-newton"])
+def test_a_strong_prior_leaves_no_motion(solver):
+    equations, functions = random_equations(5), random_functions(5)
+    model, start, believed = linear_model(equations, functions, (2, 3)), np.zeros((3, 2, 3)), prior(1e-5, (2, 3))
+    if solver == "pgd":
+        found = pgd.solve(model, functions, start, believed, most_modes=3, least_gain=0.0, noise_rms=None, **ONE_PASS)
+    else:
+        found = gauss_newton.solve(model, functions, start, believed, most_passes=3, least_change_voxel=1e-12)
+    assert np.abs(found.coefficients).max() < 1e-6
+
+
+def test_without_data_the_posterior_is_the_prior():
+    blank = replace(random_equations(1), matrix=np.zeros((9, 6, 6)), vector=np.zeros((9, 6)))
+    functions = random_functions(1)
+    known = posterior(blank, functions, prior(2.5, (2, 3)))
+    expected = 2.5 * np.sqrt((functions**2).sum(axis=0))
+    np.testing.assert_allclose(known.deviation, np.broadcast_to(expected[:, None, None], (9, 2, 3)), rtol=1e-9)
+    np.testing.assert_allclose(known.data_share, 0, atol=1e-9)
+    assert not known.observed.any()
+
+
+def test_the_data_s_share_is_what_they_took_of_the_prior_s_variance():
+    equations, functions, believed = random_equations(2), random_functions(2), prior(0.3, (2, 3))
+    known = posterior(equations, functions, believed)
+    before = 0.3**2 * (functions**2).sum(axis=0)[:, None, None]
+    np.testing.assert_allclose(known.data_share, 1 - known.deviation**2 / before, atol=1e-9)
+    assert ((known.data_share > 0) & (known.data_share < 1)).all()
+
+
+def test_more_data_never_make_an_amplitude_less_known():
+    equations, functions, believed = random_equations(6), random_functions(6), prior(0.3, (2, 3))
+    once = posterior(equations, functions, believed)
+    # every pixel seen twice, with the same rms residual
+    twice = replace(equations, matrix=2 * equations.matrix, chi2=2 * equations.chi2, pixels=2 * equations.pixels)
+    assert (posterior(twice, functions, believed).deviation < once.deviation).all()
+
+
+def test_posterior_deviations_are_the_scatter_over_noise_draws():
+    """Sensitivities of the small sample, linear model: 300 draws of white noise, the direct solve of each."""
+    noise = 0.02
+    start = equations_of(ZERO)
+    functions, believed = time_functions(), prior(1e3)
+    rng = np.random.default_rng(11)
+    pixels = SHAPE[0] * SHAPE[1]
+    roots = [np.linalg.cholesky(b + 1e-9 * np.trace(b) * np.eye(UNKNOWNS)) for b in start.matrix]
+    hessian = sum(np.kron(np.outer(functions[:, t], functions[:, t]), start.matrix[t]) for t in range(STEPS))
+    draws = []
+    for _ in range(300):
+        # c = S^T noise has covariance noise^2 B, whatever S
+        c = noise * np.stack([root @ rng.normal(size=UNKNOWNS) for root in roots])
+        solved = np.linalg.solve(hessian, (functions @ c).ravel()).reshape(FUNCTIONS, UNKNOWNS)
+        draws.append(functions.T @ solved)
+    scatter = np.std(draws, axis=0).reshape(STEPS, *SECTIONS.shape)
+    noisy = replace(start, chi2=np.full(STEPS, pixels * noise**2))
+    # a deviation from 300 draws is known to 4 %
+    ratio = posterior(noisy, functions, believed).deviation / scatter
+    assert np.abs(ratio - 1).max() < 0.2
+    assert np.abs(ratio.mean() - 1) < 0.03
+
+
+def test_a_section_out_of_the_window_is_unobserved():
+    """The window sees 1.2 mm up and down; a section's hat reaches to its neighbours."""
+    far = SectionBasis(height_mm=np.array([-1.2, 0.0, 1.25, 1.4, 1.55]), radius_mm=0.5)
+    images = radiographs(far, np.zeros((STEPS, *far.shape)))
+    known = posterior(linearise(images, far, np.zeros((STEPS, *far.shape))), time_functions(), prior(1.0, far.shape))
+    np.testing.assert_array_equal(known.observed, [True, True, True, False, False])
+    expected = np.sqrt((time_functions() ** 2).sum(axis=0))
+    np.testing.assert_allclose(
+        known.deviation[:, 3:], np.broadcast_to(expected[:, None, None], (STEPS, 2, 6)), rtol=1e-6
+    )
+
+
+# The inverse crime on purpose
+
+
+@cache
+def true_motion():
+    """Return coefficients (function, section, motion) of a motion of one to three voxels."""
+    return np.random.default_rng(12).normal(scale=0.45, size=ZERO.shape)
+
+
+@cache
+def rank_one():
+    """Return (temporal coefficients, spatial amplitudes, their product) of one space-time mode."""
+    rng = np.random.default_rng(13)
+    a = np.array([0.3, -0.2, 0.8, 0.5])
+    b = rng.normal(scale=0.8, size=SECTIONS.shape)
+    return a, b, np.einsum("f,jk->fjk", a, b)
+
+
+def moved(coefficients):
+    return np.einsum("ft,fjk->tjk", time_functions(), coefficients)
+
+
+@cache
+def images_of(which):
+    return radiographs(SECTIONS, moved(true_motion() if which == "full" else rank_one()[2]))
+
+
+def equations_of(coefficients, which="full"):
+    return linearise(images_of(which), SECTIONS, moved(coefficients))
+
+
+def rms_displacement(coefficients):
+    """Return the rms displacement, over steps and points of the bar in the window, voxels."""
+    z, y, x = np.meshgrid(np.linspace(-1.0, 1.0, 9), [-0.3, 0.0, 0.3], [-0.45, 0.0, 0.45], indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=-1)
+    u = np.array([SECTIONS.displacement(amplitude, points) for amplitude in moved(coefficients)])
+    return np.sqrt((u**2).sum(axis=-1).mean())
+
+
+@cache
+def recovered():
+    return gauss_newton.solve(
+        lineariser(images_of("full"), SECTIONS),
+        time_functions(),
+        ZERO,
+        prior(),
+        most_passes=25,
+        least_change_voxel=1e-4,
+    )
+
+
+def test_gauss_newton_gives_the_motion_back():
+    assert 1 < rms_displacement(true_motion()) < 3
+    assert rms_displacement(recovered().coefficients - true_motion()) < 1e-3
+
+
+def test_gauss_newton_lowers_the_residual_in_every_pass_and_says_that_it_converged():
+    assert (np.diff(recovered().rms) < 0).all()
+    assert recovered().rms[-1] < 1e-4 * recovered().rms[0]
+    assert "converged" in recovered().stop_reason
+
+
+def pgd_of_rank_one(**options):
+    return pgd.solve(
+        lineariser(images_of("one"), SECTIONS),
+        time_functions(),
+        ZERO,
+        prior(),
+        least_gain=1e-3,
+        noise_rms=None,
+        **options,
+    )
+
+
+def test_one_mode_found_about_itself_gives_a_rank_one_motion_back():
+    found = pgd_of_rank_one(most_modes=1, passes_per_mode=12)
+    assert len(found.temporal) == 1
+    assert (np.diff(found.rms) < 0).all()
+    assert rms_displacement(found.coefficients - rank_one()[2]) < 1e-3
+
+
+def test_modes_of_one_pass_lower_the_residual_one_by_one_and_add_up_to_the_motion():
+    found = pgd_of_rank_one(most_modes=12, **ONE_PASS)
+    assert (np.diff(found.rms) < 0).all()
+    assert found.rms[-1] < 1e-3 * found.rms[0]
+    assert rms_displacement(found.coefficients - rank_one()[2]) < 5e-3
+    total = np.einsum("mt,mjk->tjk", found.temporal, found.spatial)
+    np.testing.assert_allclose(total, moved(found.coefficients), atol=1e-9)
+
+
+def test_one_pass_from_four_times_closer_ends_more_than_four_times_closer():
+    errors = []
+    for size in (0.4, 0.1):
+        start = true_motion() * (1 + size)
+        found = gauss_newton.solve(
+            lineariser(images_of("full"), SECTIONS), time_functions(), start, prior(), most_passes=1,
+            least_change_voxel=1e-9,
+        )  # fmt: skip
+        errors.append(rms_displacement(found.coefficients - true_motion()))
+    assert errors[1] < errors[0] / 4
+
+
+def test_the_equations_at_the_truth_ask_for_nothing():
+    at_truth = equations_of(true_motion())
+    assert at_truth.rms < 1e-5
+    np.testing.assert_allclose(
+        residuals(images_of("full"), SECTIONS, moved(true_motion())), at_truth.residual, atol=1e-5
+    )
+
+
+def test_the_systematic_residual_is_taken_off_the_radiographs():
+    """A constant left by the re-projection, found in all views, changes the residual by just that."""
+    images = images_of("full")
+    left = np.full((1, SHAPE[0] + 8, SHAPE[1] + 8), 0.25, dtype=np.float32)
+    one = np.zeros(STEPS, dtype=np.int64)
+    systematic = Systematic(fields=left, first=one, second=one, share=np.zeros(STEPS), corner=(4, 4), shape=SHAPE)
+    rested = np.zeros((STEPS, *SECTIONS.shape))
+    plain = residuals(images, SECTIONS, rested)
+    corrected = residuals(replace(images, systematic=systematic), SECTIONS, rested)
+    np.testing.assert_allclose(plain - corrected, 0.25, atol=1e-5)
+    equations = linearise(replace(images, systematic=systematic), SECTIONS, rested)
+    np.testing.assert_allclose(equations.residual, corrected, atol=1e-5)
+
+
+def test_steps_in_another_order_give_the_same_motion():
+    order = np.random.default_rng(14).permutation(STEPS)
+    images = images_of("full")
+    shuffled = replace(images, rays=images.rays[order], grey=images.grey[order])
+    options = {"most_passes": 2, "least_change_voxel": 1e-9}
+    one = gauss_newton.solve(lineariser(images, SECTIONS), time_functions(), ZERO, prior(), **options)
+    two = gauss_newton.solve(lineariser(shuffled, SECTIONS), time_functions()[:, order], ZERO, prior(), **options)
+    np.testing.assert_allclose(two.coefficients, one.coefficients, atol=1e-8)
+    np.testing.assert_array_equal(two.equations.residual, one.equations.residual[order])
+
+
+# Why a solver stops
+
+
+def greedy(**options):
+    equations, functions = random_equations(9), random_functions(9)
+    options = {**ONE_PASS, "most_modes": 3, "least_gain": 0.0, "noise_rms": None, **options}
+    model = linear_model(equations, functions, (2, 3))
+    return pgd.solve(model, functions, np.zeros((3, 2, 3)), prior(1e3, (2, 3)), **options)
+
+
+def test_pgd_stops_at_the_most_modes():
+    found = greedy(most_modes=2)
+    assert "2 modes found, the most allowed: allow more" in found.stop_reason
+    assert len(found.temporal) == len(found.spatial) == len(found.rms) - 1 == 2
+
+
+def test_pgd_stops_at_a_mode_that_gains_too_little():
+    found = greedy(most_modes=50, least_gain=0.5)
+    assert "less than 50.00%" in found.stop_reason
+    assert len(found.temporal) == 1
+
+
+def test_pgd_stops_where_the_residual_is_that_of_two_noisy_images():
+    """chi^2 <= 2 gamma^2 N_pix."""
+    rms = random_equations(9).rms
+    assert "residual at noise level" in greedy(noise_rms=1.001 * rms / np.sqrt(2)).stop_reason
+    assert len(greedy(noise_rms=0.999 * rms / np.sqrt(2)).temporal) > 0
+
+
+def test_pgd_stops_where_no_mode_helps():
+    equations = replace(random_equations(9), vector=np.zeros((9, 6)))
+    functions = random_functions(9)
+    found = pgd.solve(
+        linear_model(equations, functions, (2, 3)),
+        functions,
+        np.zeros((3, 2, 3)),
+        prior(1e3, (2, 3)),
+        most_modes=3,
+        least_gain=0.0,
+        noise_rms=None,
+        **ONE_PASS,
+    )
+    assert "no further mode lowers the residual" in found.stop_reason
+    assert not found.coefficients.any()
+    assert found.temporal.shape == (0, 9)
+
+
+def test_gauss_newton_stops_at_the_most_passes():
+    found = gauss_newton.solve(
+        lineariser(images_of("full"), SECTIONS),
+        time_functions(),
+        ZERO,
+        prior(),
+        most_passes=1,
+        least_change_voxel=1e-9,
+    )
+    assert "1 passes done, the most allowed: allow more" in found.stop_reason
+
+
+def test_gauss_newton_stops_where_no_step_helps():
+    found = gauss_newton.solve(
+        linear_model(replace(random_equations(9), vector=np.zeros((9, 6))), None, (2, 3)),
+        random_functions(9),
+        np.zeros((3, 2, 3)),
+        prior(1e3, (2, 3)),
+        most_passes=3,
+        least_change_voxel=1e-9,
+    )
+    assert "no step lowers the residual further" in found.stop_reason
+
+
+def test_amplitudes_count_in_voxels_of_scale_1_at_any_scale():
+    """The same motion, seen by a volume of the same voxel but counted in half as large ones, is twice the number."""
+    images = replace(images_of("full"), voxel_mm=VOXEL_MM / 2)
+    doubled = gauss_newton.solve(
+        lineariser(images, SECTIONS), time_functions(), ZERO, prior(2e3), most_passes=1, least_change_voxel=1e-9
+    )
+    single = gauss_newton.solve(
+        lineariser(images_of("full"), SECTIONS),
+        time_functions(),
+        ZERO,
+        prior(),
+        most_passes=1,
+        least_change_voxel=1e-9,
+    )
+    np.testing.assert_allclose(doubled.coefficients, 2 * single.coefficients, atol=1e-6)
+
+
+def test_used_pixels_are_counted_over_all_steps():
+    weight = np.ones((1, *SHAPE), dtype=np.float32)
+    weight[:, :6] = 0
+    images = replace(images_of("full"), weight=weight)
+    assert images.used_pixels == STEPS * (SHAPE[0] - 6) * SHAPE[1]
