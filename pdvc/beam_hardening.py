@@ -135,7 +135,7 @@ def _fit(
     for i in np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int)):
         rays = ray_vectors(window, angle_rad[i]).stacked()[0]
         shape = (window.rows, window.columns)
-        length = project(volume, rays, shape, still, np.zeros(still.shape), voxel_mm=grid.voxel_mm, step=0.5)
+        length = project(volume, rays, shape, still, np.zeros(still.shape), voxel_mm=grid.voxel_mm)
         lengths.append(length.ravel())
         attenuations.append(views[i][middle].ravel())
     length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)

@@ -33,8 +33,6 @@ class Images:
     """What the volume's re-projection leaves, to be registered and subtracted; None: nothing is."""
     voxel_mm: float
     """Voxel in which amplitudes are counted, mm: that of scale 1, whatever this scale."""
-    sampling: float = 1.0
-    """Distance between the points along a ray, in voxels of the volume."""
 
     @property
     def used_pixels(self) -> int:
@@ -83,7 +81,6 @@ def linearise(
             _target(images, basis, amplitude, t),
             images.weight[t % len(images.weight)],
             voxel_mm=images.voxel_mm,
-            step=images.sampling,
         )
         matrix[t], vector[t], chi2[t], residual[t] = result.matrix, result.vector, result.chi2, result.residual
         progress(task, t + 1, steps)
@@ -104,7 +101,6 @@ def residuals(
             basis,
             amplitude[t],
             voxel_mm=images.voxel_mm,
-            step=images.sampling,
         )
         result[t] = model - _target(images, basis, amplitude, t)
         progress(task, t + 1, len(images.grey))

@@ -69,13 +69,13 @@ class Ramp(Settings):
     """powers of the steps since a start"""
     start: int = 50
     """step at which the ramp leaves zero"""
-    powers: tuple[Annotated[int, Field(ge=1)], ...] = (1, 2)
-    """exponents"""
+    powers: tuple[Annotated[int, Field(ge=0)], ...] = (1, 2)
+    """exponents; 0 makes a jump at the start"""
 
     def functions(self, series: Series) -> Floats:
         """Return (powers, step)."""
-        since = np.maximum(np.arange(len(series)) - self.start, 0) / len(series)
-        return np.stack([since**power for power in self.powers])
+        since = (np.arange(len(series)) - self.start) / len(series)
+        return np.stack([np.where(since > 0, since**power, 0.0) for power in self.powers])
 
 
 class Splines(Settings):

@@ -33,6 +33,7 @@ from pdvc.radiographs import (
     binned,
     calibrate,
     coarsened,
+    fill,
     grey_levels,
     grey_variance,
     snr_db,
@@ -239,7 +240,6 @@ def _images(
             volume=volume,
             systematic=systematic if options.subtract_systematic else None,
             voxel_mm=experiment.geometry.voxel_mm,
-            sampling=options.sampling_voxel,
         ),
         snr_reprojection_db=snr_reprojection,
         snr_noise_db=_noise_snr(grey, variance, good),
@@ -315,7 +315,6 @@ def _systematic(
             still,
             np.zeros(still.shape),
             voxel_mm=geometry.voxel_mm,
-            step=options.sampling_voxel,
         )
         fields[n, reached] = (model - grey)[reached]
         snr[n] = snr_db(grey[window], fields[n][window], np.ones_like(grey[window], dtype=bool))
@@ -368,6 +367,7 @@ def _test_radiographs(
                 frames=experiment.frames,
                 flats=len(experiment.flats),
             )
+            fine = fill(fine, calibration.bad)
             variance[t] = left * binned(fine, scale)[window]
         progress(f"radiographs, scale {scale}", t + 1, len(test))
     return grey, variance
@@ -443,6 +443,7 @@ def _solve(
             start,
             prior,
             most_modes=stage.most,
+            passes_per_mode=stage.passes_per_mode,
             least_gain=stage.least_gain,
             noise_rms=noise_rms,
         )

@@ -20,6 +20,8 @@ class StageOptions(Settings):
     """pgd: greedy modes, as in the paper; gauss-newton: all unknowns at once"""
     most: Annotated[int, Field(ge=1)] = 4
     """largest number of modes (pgd) or passes (gauss-newton)"""
+    passes_per_mode: Annotated[int, Field(ge=1)] = 1
+    """pgd: linearisations about each mode, while they help; one in the paper"""
     least_gain: Annotated[float, Field(ge=0, lt=1)] = 1e-3
     """pgd stops at a mode that lowers the rms residual by less than this share"""
     least_change_voxel: Annotated[float, Field(gt=0)] = 2e-3
@@ -51,8 +53,6 @@ class MeasureOptions(Settings):
     """all pixels alike, as in the paper, or by the inverse of their noise"""
     prior_voxel: Annotated[float, Field(gt=0)] = 30.0
     """standard deviation of every amplitude before the data, voxels (rms over the steps)"""
-    sampling_voxel: Annotated[float, Field(gt=0, le=2)] = 1.0
-    """distance between the points along a ray"""
 
     @field_validator("section_motions")
     @classmethod

@@ -12,13 +12,15 @@ the noise criterion compares chi^2 with 2 gamma^2 N_pix (both squared; 2 for noi
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior
-from pdvc.solution import Solution, evaluated, shortened
+from pdvc.solution import Solution, evaluated
 
 Floats = NDArray[np.float64]
 
@@ -33,19 +35,20 @@ def solve(
     prior: Prior,
     *,
     most_modes: int,
+    passes_per_mode: int,
     least_gain: float,
     noise_rms: float | None,
 ) -> Solution:
     """Add modes until the residual is noise, stops falling, or `most_modes` are found.
 
-    `time_functions` (function, step) orthonormal; `start` (function, section, motion) in voxels; a mode that lowers
-    the rms residual by less than the share `least_gain` is the last, and one that does not lower it, even halved
-    twice, is left out. `noise_rms` is gamma_f in grey levels, None where unknown.
+    `time_functions` (function, step) orthonormal; `start` (function, section, motion) in voxels. The paper computes
+    each mode from one linearisation; with `passes_per_mode` above one a mode is found again, about itself, while
+    that lowers the residual by more than the share `least_gain`. A mode that lowers it by less is the last, and one
+    that does not lower it, even shortened, is left out. `noise_rms` is gamma_f in grey levels, None where unknown.
     """
     shape = start.shape
     coefficients = start.reshape(len(start), -1).copy()
     at = evaluated(linearise, time_functions, shape)
-
     equations = at(coefficients)
     rms, temporal, spatial = [equations.rms], [], []
     reason = f"{most_modes} modes found, the most allowed: allow more if the residual still shows motion"
@@ -55,17 +58,25 @@ def solve(
                 f"residual at noise level: rms {equations.rms:.3g} within sqrt(2) times {noise_rms:.3g} grey levels"
             )
             break
-        a, b = find_mode(equations, time_functions, coefficients, prior)
-        step, trial = shortened(at, coefficients, np.outer(a, b), equations)
-        if trial is None:
+        before = equations.rms
+        a, b = np.zeros(len(start)), np.zeros(coefficients.shape[1])
+        for _ in range(passes_per_mode):
+            found = find_mode(equations, time_functions, coefficients, prior, now=(a, b))
+            trial = _improved(at, coefficients, (a, b), found, equations)
+            if trial is None:
+                break
+            gain = 1 - trial[2].rms / equations.rms
+            a, b, equations = trial
+            rms.append(equations.rms)
+            if gain < least_gain:
+                break
+        if equations.rms >= before:
             reason = "no further mode lowers the residual: what is left lies outside the bases, or is noise"
             break
-        coefficients = coefficients + step * np.outer(a, b)
+        coefficients = coefficients + np.outer(a, b)
         temporal.append(a @ time_functions)
-        spatial.append((step * b).reshape(shape[1:]))
-        gain = 1 - trial.rms / equations.rms
-        equations = trial
-        rms.append(equations.rms)
+        spatial.append(b.reshape(shape[1:]))
+        gain = 1 - equations.rms / before
         if gain < least_gain:
             reason = f"the last mode lowered the rms residual by {gain:.2%}, less than {least_gain:.2%}"
             break
@@ -79,25 +90,36 @@ def solve(
     )
 
 
-def find_mode(
-    equations: Equations, time_functions: Floats, coefficients: Floats, prior: Prior
-) -> tuple[Floats, Floats]:
-    """Return a (function,), of norm 1, and b (section * motion,) that lower chi2 most, by the fixed point.
+Mode = tuple[Floats, Floats]
+"""a (function,) of norm one, and b (section * motion,) in voxels."""
 
-    Every time function alone is tried as a start, and the best one is followed.
+
+def find_mode(
+    equations: Equations, time_functions: Floats, coefficients: Floats, prior: Prior, now: Mode | None = None
+) -> Mode:
+    """Return the mode that lowers chi2 most, by the fixed point of Eqs. 12 and 15.
+
+    `coefficients` (function, section * motion) are what the mode is added to; where the equations were made with a
+    mode `now` already added, the mode that replaces it is returned. Without one, every time function alone is
+    tried as a start, and the best is followed.
     """
     ridge = equations.rms**2 * prior.precision()
-    starts = np.eye(len(time_functions))
-    gains = []
-    for a in starts:
-        matrix, vector = _spatial(equations, time_functions, coefficients, ridge, a)
-        gains.append(vector @ _solved(matrix, vector))
-    a = starts[int(np.argmax(gains))]
-    b = np.zeros(coefficients.shape[1])
+    vectors = equations.vector
+    if now is not None and now[1].any():
+        # linear about the present mode: chi2(m) = m B m - 2 m (c + B m_now), with m = alpha b
+        alpha = now[0] @ time_functions
+        vectors = vectors + alpha[:, None] * (equations.matrix @ now[1])
+        a, b = now
+    else:
+        gains = []
+        for start in np.eye(len(time_functions)):
+            matrix, vector = _spatial(equations.matrix, vectors, time_functions, coefficients, ridge, start)
+            gains.append(vector @ _solved(matrix, vector))
+        a, b = np.eye(len(time_functions))[int(np.argmax(gains))], np.zeros(coefficients.shape[1])
     for _ in range(FIXED_POINT_MOST):
         before = np.outer(a, b)
-        b = _solved(*_spatial(equations, time_functions, coefficients, ridge, a))
-        a = _solved(*_temporal(equations, time_functions, coefficients, ridge, b))
+        b = _solved(*_spatial(equations.matrix, vectors, time_functions, coefficients, ridge, a))
+        a = _solved(*_temporal(equations.matrix, vectors, time_functions, coefficients, ridge, b))
         size = np.linalg.norm(a)
         if size == 0:
             break
@@ -108,19 +130,34 @@ def find_mode(
 
 
 def _spatial(
-    equations: Equations, time_functions: Floats, coefficients: Floats, ridge: Floats, a: Floats
+    matrices: Floats, vectors: Floats, time_functions: Floats, coefficients: Floats, ridge: Floats, a: Floats
 ) -> tuple[Floats, Floats]:
+    """Return N and n of Eqs. 13 and 14, with the prior's terms."""
     alpha = a @ time_functions
-    matrix = np.tensordot(alpha**2, equations.matrix, axes=1) + np.diag(ridge * (a @ a))
-    return matrix, alpha @ equations.vector - ridge * (a @ coefficients)
+    matrix = np.tensordot(alpha**2, matrices, axes=1) + np.diag(ridge * (a @ a))
+    return matrix, alpha @ vectors - ridge * (a @ coefficients)
 
 
 def _temporal(
-    equations: Equations, time_functions: Floats, coefficients: Floats, ridge: Floats, b: Floats
+    matrices: Floats, vectors: Floats, time_functions: Floats, coefficients: Floats, ridge: Floats, b: Floats
 ) -> tuple[Floats, Floats]:
-    curvature = (equations.matrix @ b) @ b
+    """Return M and m of Eqs. 16 and 17, with the prior's terms."""
+    curvature = (matrices @ b) @ b
     matrix = (time_functions * curvature) @ time_functions.T + np.eye(len(time_functions)) * (b @ (ridge * b))
-    return matrix, time_functions @ (equations.vector @ b) - coefficients @ (ridge * b)
+    return matrix, time_functions @ (vectors @ b) - coefficients @ (ridge * b)
+
+
+def _improved(
+    at: Callable[[Floats], Equations], coefficients: Floats, now: Mode, found: Mode, equations: Equations
+) -> tuple[Floats, Floats, Equations] | None:
+    """Try the mode found, then ways half and a quarter towards it; None where none lowers the residual."""
+    for share in (1.0, 0.5, 0.25):
+        # a mixture of two modes is none, so that the way from one to the other keeps the new history
+        a, b = found[0], share * found[1] + (1 - share) * (now[0] @ found[0]) * now[1]
+        trial = at(coefficients + np.outer(a, b))
+        if trial.rms < equations.rms:
+            return a, b, trial
+    return None
 
 
 def _solved(matrix: Floats, vector: Floats) -> Floats:

@@ -11,10 +11,15 @@ For one step, with F the reference volume, u the trial motion and a ray x(s) fro
 so that chi2 = sum_r w rho^2 is lowered by the solution of B da = c. Neither S nor the warped volume is stored:
 each ray is walked once, and its sensitivities are added into B and c and forgotten.
 
-The integrals are sums over points that lie `step` voxels apart, with trilinear interpolation of F and the exact
-gradient of that interpolation. Between two sections u is a quadratic polynomial of the ray's arc length, and so
-is everything that multiplies grad F; the sensitivities of all motions follow from nine sums, of
-grad F, l grad F and l^2 grad F, however many motions a section has.
+The integrals are sums over the voxel planes that the moved ray x'(l) = x(l) - u(x(l)) crosses (Joseph, 1982): along
+x or y, whichever the ray follows more, with bilinear interpolation of F, and its exact gradient, in each plane.
+Between two sections u is a quadratic polynomial of the ray's arc length l, and so is everything that multiplies
+grad F. With m the axis across the planes, o the two others and t = dx'/dl, the missing derivative follows by parts,
+
+    int l^n d_m F dl = -sum_o (t_o / t_m) int l^n d_o F dl - (n / t_m) int l^(n-1) F dl,
+
+as F vanishes at both ends of the ray: eight sums, of F, l F and d_o F times 1, l, l^2, give the sensitivities of
+all motions, however many a section has.
 
 Sums run in single precision along a ray, in double precision over rays. Bands of rows are worked on in
 parallel and added in order, so that the result does not depend on the number of threads.
@@ -67,15 +72,14 @@ def normal_equations(
     weight: Image,
     *,
     voxel_mm: float,
-    step: float = 1.0,
 ) -> StepEquations:
     """Compare a radiograph with the moved volume, and return its normal equations.
 
     `rays` (4, 3) in mm as of RayVectors.stacked, for the window that `target` (row, column) covers;
-    `amplitude` (section, motion) in voxels of `voxel_mm`; `weight` (row, column), zero for unused pixels;
-    `step` in voxels of the volume.
+    `amplitude` (section, motion) in voxels of `voxel_mm`; `weight` (row, column), zero for unused
+    pixels.
     """
-    equations = _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, step, True)
+    equations = _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, True)
     assert equations is not None
     return equations
 
@@ -88,11 +92,10 @@ def project(
     amplitude: Floats,
     *,
     voxel_mm: float,
-    step: float = 1.0,
 ) -> Image:
     """Return the radiograph P[F~] (row, column), grey levels, of the moved volume."""
     blank = np.zeros(shape, dtype=np.float32)
-    return _walk(volume, rays, basis, amplitude, blank, blank, voxel_mm, step, False).residual
+    return _walk(volume, rays, basis, amplitude, blank, blank, voxel_mm, False).residual
 
 
 def _walk(
@@ -103,7 +106,6 @@ def _walk(
     target: Image,
     weight: Image,
     voxel_mm: float,
-    step: float,
     sensitivities: bool,
 ) -> StepEquations:
     """Prepare one step in index coordinates of the volume, walk its rays, and add the bands in order."""
@@ -137,7 +139,6 @@ def _walk(
         np.ascontiguousarray(patterns.reshape(*basis.shape, 12)),
         target,
         weight,
-        step,
         grid.voxel_mm,
         sensitivities,
         low,
@@ -221,70 +222,97 @@ def _band_sections(
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _sum_all(volume, stride_y, stride_z, limit, first, last, step, path):  # type: ignore[no-untyped-def]
-    """Sum F, and grad F times 1, l, l^2, at l = (m + 1/2) step, first <= m < last; path = x'(l)."""
-    ax, bx, cx, ay, by, cy, az, bz, cz = path
-    mx, my, mz = limit
-    s = v0 = g0 = g1 = g2 = h0 = h1 = h2 = k0 = k1 = k2 = _f(0)
-    one = np.uint32(1)
-    for m in range(first, last):
-        t = (_f(m) + _f(0.5)) * step
-        x = min(max(ax + t * (bx + t * cx), _f(0)), mx)
-        y = min(max(ay + t * (by + t * cy), _f(0)), my)
-        z = min(max(az + t * (bz + t * cz), _f(0)), mz)
-        ix, iy, iz = np.int32(x), np.int32(y), np.int32(z)
-        fx, fy, fz = x - _f(ix), y - _f(iy), z - _f(iz)
-        o = np.uint32(iz * stride_z + iy * stride_y + ix)
-        p = o + stride_z
-        a000, a001, a010, a011 = volume[o], volume[o + one], volume[o + stride_y], volume[o + stride_y + one]
-        a100, a101, a110, a111 = volume[p], volume[p + one], volume[p + stride_y], volume[p + stride_y + one]
-        d00, d01, d10, d11 = a001 - a000, a011 - a010, a101 - a100, a111 - a110
-        c00, c01, c10, c11 = a000 + fx * d00, a010 + fx * d01, a100 + fx * d10, a110 + fx * d11
-        e0, e1 = c01 - c00, c11 - c10
-        b0 = c00 + fy * e0
-        gz = c10 + fy * e1 - b0
-        gy = e0 + fz * (e1 - e0)
-        x0 = d00 + fy * (d01 - d00)
-        gx = x0 + fz * (d10 + fy * (d11 - d10) - x0)
-        v0 += b0 + fz * gz
-        g0 += gx
-        g1 += gy
-        g2 += gz
-        s = t * gx
-        h0 += s
-        k0 += t * s
-        s = t * gy
-        h1 += s
-        k1 += t * s
-        s = t * gz
-        h2 += s
-        k2 += t * s
-    return v0, g0, g1, g2, h0, h1, h2, k0, k1, k2
+def _sum_all(volume, strides, limit, first, last, path):  # type: ignore[no-untyped-def]
+    """Sum F times 1, l, and d_o F times 1, l, l^2, over the planes first <= k < last that the ray crosses.
+
+    `path` holds the coefficients of x'(l) for the axes m, o, z, and `strides` and `limit` theirs.
+    """
+    am, bm, cm, ao, bo, co, az, bz, cz = path
+    stride_m, stride_o, stride_z = strides
+    most_o, most_z = limit
+    turn = _f(1) / bm
+    bend = cm * turn
+    v0 = v1 = g0 = g1 = g2 = h0 = h1 = h2 = _f(0)
+    for k in range(first, last):
+        t = (_f(k) - am) * turn
+        t -= bend * t * t * (_f(1) - _f(2) * bend * t)
+        share = _f(1) - _f(2) * bend * t
+        o = min(max(ao + t * (bo + t * co), _f(0)), most_o)
+        z = min(max(az + t * (bz + t * cz), _f(0)), most_z)
+        io, iz = np.int32(o), np.int32(z)
+        fo, fz = o - _f(io), z - _f(iz)
+        p = np.uint32(iz * stride_z + io * stride_o + np.uint32(k) * stride_m)
+        q = p + stride_z
+        a00, a01, a10, a11 = volume[p], volume[p + stride_o], volume[q], volume[q + stride_o]
+        d0, d1 = a01 - a00, a11 - a10
+        low = a00 + fo * d0
+        dz = a10 + fo * d1 - low
+        value = share * (low + fz * dz)
+        do = share * (d0 + fz * (d1 - d0))
+        dz *= share
+        v0 += value
+        v1 += t * value
+        g0 += do
+        h0 += dz
+        do *= t
+        dz *= t
+        g1 += do
+        h1 += dz
+        g2 += t * do
+        h2 += t * dz
+    return v0, v1, g0, g1, g2, h0, h1, h2
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _sum_values(volume, stride_y, stride_z, limit, first, last, step, path):  # type: ignore[no-untyped-def]
-    """Sum F at l = (m + 1/2) step, first <= m < last; path = x'(l)."""
-    ax, bx, cx, ay, by, cy, az, bz, cz = path
-    mx, my, mz = limit
+def _sum_values(volume, strides, limit, first, last, path):  # type: ignore[no-untyped-def]
+    """Sum F over the planes first <= k < last that the ray crosses; arguments as of _sum_all."""
+    am, bm, cm, ao, bo, co, az, bz, cz = path
+    stride_m, stride_o, stride_z = strides
+    most_o, most_z = limit
+    turn = _f(1) / bm
+    bend = cm * turn
     v0 = _f(0)
-    one = np.uint32(1)
-    for m in range(first, last):
-        t = (_f(m) + _f(0.5)) * step
-        x = min(max(ax + t * (bx + t * cx), _f(0)), mx)
-        y = min(max(ay + t * (by + t * cy), _f(0)), my)
-        z = min(max(az + t * (bz + t * cz), _f(0)), mz)
-        ix, iy, iz = np.int32(x), np.int32(y), np.int32(z)
-        fx, fy, fz = x - _f(ix), y - _f(iy), z - _f(iz)
-        o = np.uint32(iz * stride_z + iy * stride_y + ix)
-        p = o + stride_z
-        a000, a001, a010, a011 = volume[o], volume[o + one], volume[o + stride_y], volume[o + stride_y + one]
-        a100, a101, a110, a111 = volume[p], volume[p + one], volume[p + stride_y], volume[p + stride_y + one]
-        c00, c01 = a000 + fx * (a001 - a000), a010 + fx * (a011 - a010)
-        c10, c11 = a100 + fx * (a101 - a100), a110 + fx * (a111 - a110)
-        b0 = c00 + fy * (c01 - c00)
-        v0 += b0 + fz * (c10 + fy * (c11 - c10) - b0)
+    for k in range(first, last):
+        t = (_f(k) - am) * turn
+        t -= bend * t * t * (_f(1) - _f(2) * bend * t)
+        o = min(max(ao + t * (bo + t * co), _f(0)), most_o)
+        z = min(max(az + t * (bz + t * cz), _f(0)), most_z)
+        io, iz = np.int32(o), np.int32(z)
+        fo, fz = o - _f(io), z - _f(iz)
+        p = np.uint32(iz * stride_z + io * stride_o + np.uint32(k) * stride_m)
+        q = p + stride_z
+        a00, a01, a10, a11 = volume[p], volume[p + stride_o], volume[q], volume[q + stride_o]
+        low = a00 + fo * (a01 - a00)
+        v0 += (_f(1) - _f(2) * bend * t) * (low + fz * (a10 + fo * (a11 - a10) - low))
     return v0
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _planes(path, a, b, count):  # type: ignore[no-untyped-def]
+    """Return the planes [first, last) that the ray crosses between a and b, each counted in one interval only."""
+    start = path[0] + a * (path[1] + a * path[2])
+    end = path[0] + b * (path[1] + b * path[2])
+    if end >= start:
+        first, last = int(np.ceil(start)), int(np.ceil(end))
+    else:
+        first, last = int(np.floor(end)) + 1, int(np.floor(start)) + 1
+    return max(first, 0), min(last, count)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _nine_sums(sums, path, along_x):  # type: ignore[no-untyped-def]
+    """Complete the sums of d_i F times 1, l, l^2, for i = x, y, z, by parts along the axis across the planes."""
+    v0, v1 = sums[0], sums[1]
+    g0, g1, g2 = np.float64(sums[2]), np.float64(sums[3]), np.float64(sums[4])
+    h0, h1, h2 = np.float64(sums[5]), np.float64(sums[6]), np.float64(sums[7])
+    turn = 1.0 / path[1]
+    o, z = path[4] * turn, path[7] * turn
+    m0 = -o * g0 - z * h0
+    m1 = -o * g1 - z * h1 - turn * v0
+    m2 = -o * g2 - z * h2 - 2 * turn * v1
+    if along_x:
+        return m0, g0, h0, m1, g1, h1, m2, g2, h2
+    return g0, m0, h0, g1, m1, h1, g2, m2, h2
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -355,7 +383,7 @@ def _quadratic(first, second, base, along, s0, s1):  # type: ignore[no-untyped-d
 def _add_section(pattern, w0, w1, base, along, sums, scale, k, out):  # type: ignore[no-untyped-def]
     """Add to `out` (motion,) the integral of (w0 + w1 l) Psi(x(l)) . grad F, from the nine sums; `k` is scratch."""
     for i in range(3):
-        m0, m1, m2 = sums[1 + i], sums[4 + i], sums[7 + i]
+        m0, m1, m2 = sums[i], sums[3 + i], sums[6 + i]
         flat, tilted = (w0 * m0 + w1 * m1) * scale, (w0 * m1 + w1 * m2) * scale
         for j in range(3):
             k[4 * i + j] = flat * base[j] + tilted * along[j]
@@ -390,7 +418,6 @@ def _walk_bands(  # type: ignore[no-untyped-def]
     patterns,
     target,
     weight,
-    step,
     voxel_mm,
     sensitivities,
     low,
@@ -413,7 +440,6 @@ def _walk_bands(  # type: ignore[no-untyped-def]
             patterns,
             target,
             weight,
-            step,
             voxel_mm,
             sensitivities,
             low[band],
@@ -438,7 +464,6 @@ def _walk_band(  # type: ignore[no-untyped-def]
     patterns,
     target,
     weight,
-    step,
     voxel_mm,
     sensitivities,
     low,
@@ -451,10 +476,11 @@ def _walk_band(  # type: ignore[no-untyped-def]
     """Walk the rays of one band of rows."""
     rows, columns = target.shape
     n, motions = patterns.shape[0], patterns.shape[1]
-    stride_y, stride_z = np.uint32(shape[2]), np.uint32(shape[2] * shape[1])
-    limit = (_f(shape[2] - 1.0001), _f(shape[1] - 1.0001), _f(shape[0] - 1.0001))
-    step32 = _f(step)
-    scale = step * voxel_mm
+    nx, ny = shape[2], shape[1]
+    row_of, layer = np.uint32(nx), np.uint32(nx * ny)
+    # strides of the axis across the planes, of the other horizontal axis, and of z; largest index of the last two
+    to_x, most_x = (np.uint32(1), row_of, layer), (_f(ny - 1.0001), _f(shape[0] - 1.0001))
+    to_y, most_y = (row_of, np.uint32(1), layer), (_f(nx - 1.0001), _f(shape[0] - 1.0001))
     normals, limit16 = _NORMALS32, np.empty(_NORMALS32.shape[1], np.float32)
     s = np.zeros(max(vector.shape[0], 1))
     base, along, k12 = np.empty(3), np.empty(3), np.empty(12)
@@ -496,40 +522,37 @@ def _walk_band(  # type: ignore[no-untyped-def]
                 path = _quadratic(maps[j0], maps[j1], base, along, s0, s1)
                 inner_a, inner_b = _clip_hull(place, support, normals, limit16, a, b, path)
                 if inner_a < inner_b:
-                    # points m + 1/2 are shared out so that each belongs to one interval
-                    first = int(np.ceil(inner_a / step - 0.5))
-                    last = int(np.ceil(inner_b / step - 0.5))
+                    ax, bx, cx, ay, by, cy, az, bz, cz = path
+                    along_x = abs(bx) >= abs(by)
+                    if along_x:
+                        turned, strides, limit, count = (ax, bx, cx, ay, by, cy, az, bz, cz), to_x, most_x, nx
+                    else:
+                        turned, strides, limit, count = (ay, by, cy, ax, bx, cx, az, bz, cz), to_y, most_y, ny
+                    first, last = _planes(turned, inner_a, inner_b, count)
                     if last > first:
-                        path32 = (
-                            _f(path[0]),
-                            _f(path[1]),
-                            _f(path[2]),
-                            _f(path[3]),
-                            _f(path[4]),
-                            _f(path[5]),
-                            _f(path[6]),
-                            _f(path[7]),
-                            _f(path[8]),
-                        )
+                        am, bm, cm, ao, bo, co, az, bz, cz = turned
+                        path32 = (_f(am), _f(bm), _f(cm), _f(ao), _f(bo), _f(co), _f(az), _f(bz), _f(cz))
+                        scale = voxel_mm / abs(bm)
                         if sensitivities:
-                            sums = _sum_all(volume, stride_y, stride_z, limit, first, last, step32, path32)
-                            value += sums[0]
+                            sums = _sum_all(volume, strides, limit, first, last, path32)
+                            value += sums[0] * scale
+                            nine = _nine_sums(sums, turned, along_x)
                             if k_last < 0:
                                 k_first, k_last = j0, j1
                             k_first, k_last = min(k_first, j0), max(k_last, j1)
                             at = (j0 - low) * motions
                             out = s[at : at + motions]
                             if j0 == j1:
-                                _add_section(patterns[j0], 1.0, 0.0, base, along, sums, scale, k12, out)
+                                _add_section(patterns[j0], 1.0, 0.0, base, along, nine, scale, k12, out)
                             else:
-                                _add_section(patterns[j0], 1.0 - s0, -s1, base, along, sums, scale, k12, out)
+                                _add_section(patterns[j0], 1.0 - s0, -s1, base, along, nine, scale, k12, out)
                                 at = (j1 - low) * motions
                                 out = s[at : at + motions]
-                                _add_section(patterns[j1], s0, s1, base, along, sums, scale, k12, out)
+                                _add_section(patterns[j1], s0, s1, base, along, nine, scale, k12, out)
                         else:
-                            value += _sum_values(volume, stride_y, stride_z, limit, first, last, step32, path32)
+                            value += scale * _sum_values(volume, strides, limit, first, last, path32)
                 a = b
-            rho = value * scale - target[row, column]
+            rho = value - target[row, column]
             residual[row, column] = rho
             w = weight[row, column]
             chi2[band] += w * rho * rho
