@@ -13,7 +13,7 @@ from pdvc.equations import Images, linearise
 from pdvc.experiment import Series
 from pdvc.geometry import ConeBeam
 from pdvc.history import Angle, Polynomial, time_basis
-from pdvc.projection import _moved_box, project
+from pdvc.projection import project
 from pdvc.rays import ray_vectors
 from pdvc.sections import SectionBasis
 from pdvc.volume import Grid, Hull, Volume, hull_of
@@ -75,65 +75,72 @@ def motion(basis: SectionBasis, seed: int = 0, size: float = 1.0) -> Floats:
     return np.random.default_rng(seed).normal(scale=size, size=basis.shape)
 
 
-def trilinear(values: NDArray[np.float32], index: Floats) -> tuple[Floats, Floats]:
-    """Return the trilinear value (...,) and its gradient (..., 3) at points (x, y, z) in voxel indices; 0 outside."""
+def trilinear(values: NDArray[np.float32], index: Floats) -> Floats:
+    """Return the trilinear value (...,) at points (x, y, z) in voxel indices; 0 outside."""
     nz, ny, nx = values.shape
     cell = np.floor(index).astype(int)
     inside = ((cell >= 0) & (cell < np.array([nx, ny, nz]) - 1)).all(axis=-1)
     cell = np.where(inside[..., None], cell, 0)
     part = index - cell
-    value, gradient = np.zeros(index.shape[:-1]), np.zeros(index.shape)
+    value = np.zeros(index.shape[:-1])
     for corner in product((0, 1), repeat=3):
-        at = values[cell[..., 2] + corner[2], cell[..., 1] + corner[1], cell[..., 0] + corner[0]].astype(float)
-        share = np.where(corner, part, 1 - part)
-        sign = np.where(corner, 1.0, -1.0)
-        value += at * share.prod(axis=-1)
-        for i in range(3):
-            gradient[..., i] += at * sign[i] * share[..., (i + 1) % 3] * share[..., (i + 2) % 3]
-    return np.where(inside, value, 0), np.where(inside[..., None], gradient, 0)
+        at = values[cell[..., 2] + corner[2], cell[..., 1] + corner[1], cell[..., 0] + corner[0]]
+        value += at.astype(float) * np.where(corner, part, 1 - part).prod(axis=-1)
+    return np.where(inside, value, 0)
+
+
+def plane_sums(
+    volume: Volume, rays: Floats, shape: tuple[int, int], basis: SectionBasis, amplitude: Floats, voxel_mm: float
+) -> Floats:
+    """Return P (pixel,) in plain numpy and double precision: Joseph's sums over the planes of voxels.
+
+    The ray x(l) passes plane k of the moved volume where coordinate m of x - u(x) is that of the plane, m being x or
+    y, whichever the ray follows more. There F is interpolated, and counts for the length dl from plane to plane.
+    """
+    grid, origin = volume.grid, np.array(volume.grid.origin_mm)
+    row, column = (index.ravel()[:, None] for index in np.indices(shape))
+    along = rays[1] + row * rays[2] + column * rays[3] - rays[0]
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    axis = np.where(np.abs(along[:, 0]) >= np.abs(along[:, 1]), 0, 1)
+    planes = np.arange(max(grid.shape[1:]))
+    real = planes < np.where(axis == 0, grid.shape[2], grid.shape[1])[:, None]
+    slope = np.take_along_axis(along, axis[:, None], 1) / grid.voxel_mm
+
+    def was(length: Floats) -> Floats:
+        """Return x - u(x) in voxel indices, for lengths (pixel, plane)."""
+        x = rays[0] + length[..., None] * along[:, None]
+        u = basis.displacement(amplitude, x.reshape(-1, 3)).reshape(x.shape)
+        return (x - u * voxel_mm - origin) / grid.voxel_mm
+
+    def coordinate(length: Floats) -> Floats:
+        return np.take_along_axis(was(length), axis[:, None, None], 2)[..., 0]
+
+    start = np.take_along_axis(rays[0][None] - origin, axis[:, None], 1) / grid.voxel_mm
+    length = (planes - start) / slope
+    for _ in range(8):
+        length -= (coordinate(length) - planes) / slope
+    nudge = 1e-4 * grid.voxel_mm
+    spacing = 2 * nudge / np.abs(coordinate(length + nudge) - coordinate(length - nudge))
+    value = trilinear(volume.values, was(length) + 1e-9)
+    return np.asarray(np.where(real, value * spacing, 0).sum(axis=1))
 
 
 def stored(
-    volume: Volume,
-    rays: Floats,
-    shape: tuple[int, int],
-    basis: SectionBasis,
-    amplitude: Floats,
-    voxel_mm: float,
-    step: float = 1.0,
+    volume: Volume, rays: Floats, shape: tuple[int, int], basis: SectionBasis, amplitude: Floats, voxel_mm: float
 ) -> tuple[Floats, Floats]:
-    """Return P (pixel,) and all of S (pixel, unknown) of Eq. 10, from the formulas, in double precision.
+    """Return P (pixel,) and all of S = -dP/da (pixel, unknown), by central differences of `plane_sums`."""
 
-    Points lie at l = (m + 1/2) step along each ray, in voxels of the volume, from where the ray passes the middle of
-    the moved sample: only that middle is taken from the code under test.
-    """
-    grid = volume.grid
-    origin = np.array(grid.origin_mm)
-    maps = basis.affine(amplitude).copy() * voxel_mm / grid.voxel_mm
-    maps[..., 3] += maps[..., :3] @ origin
-    maps[..., :3] *= grid.voxel_mm
-    middle = origin + grid.voxel_mm * _moved_box(volume, (basis.height_mm - origin[2]) / grid.voxel_mm, maps).mean(
-        axis=0
-    )
-    row, column = np.indices(shape)
-    along = rays[1] + row[..., None] * rays[2] + column[..., None] * rays[3] - rays[0]
-    along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    base = rays[0] + ((middle - rays[0]) * along).sum(axis=-1, keepdims=True) * along
-    half = int(np.linalg.norm(grid.shape) / step) // 2 + 20
-    length = (np.arange(-half, half) + 0.5) * step * grid.voxel_mm
-    x = (base[:, :, None] + length[:, None] * along[:, :, None]).reshape(-1, 3)
-    u = basis.displacement(amplitude, x)
-    value, gradient = trilinear(volume.values, (x - u * voxel_mm - origin) / grid.voxel_mm)
-    gradient /= grid.voxel_mm  # per mm
-    weight = step * grid.voxel_mm
-    pixels = (shape[0] * shape[1], len(length))
-    columns = []
-    for j, k in product(range(basis.shape[0]), range(basis.shape[1])):
-        unit = np.zeros(basis.shape)
-        unit[j, k] = 1
-        shown = (basis.displacement(unit, x) * voxel_mm * gradient).sum(axis=-1)
-        columns.append(shown.reshape(pixels).sum(axis=1) * weight)
-    return value.reshape(pixels).sum(axis=1) * weight, np.stack(columns, axis=1)
+    def shifted(j: int, k: int, change: float) -> Floats:
+        trial = amplitude.copy()
+        trial[j, k] += change
+        return plane_sums(volume, rays, shape, basis, trial, voxel_mm)
+
+    change = 1e-3
+    columns = [
+        (shifted(j, k, -change) - shifted(j, k, change)) / (2 * change)
+        for j, k in product(range(basis.shape[0]), range(basis.shape[1]))
+    ]
+    return plane_sums(volume, rays, shape, basis, amplitude, voxel_mm), np.stack(columns, axis=1)
 
 
 @cache

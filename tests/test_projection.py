@@ -21,6 +21,7 @@ from tests.small_case import (
     VOXEL_MM,
     hull_around,
     motion,
+    plane_sums,
     rays_at,
     stored,
     textured,
@@ -91,17 +92,6 @@ def test_a_translated_blob_is_where_the_translation_takes_it():
     assert np.sqrt(np.mean((moved - exact) ** 2)) < 7e-4 * exact.max()
 
 
-def test_a_finer_step_along_the_ray_changes_little_and_less_the_finer():
-    rays = rays_at(0.4)
-    finest, fine, coarse = (
-        project(textured(), rays, SHAPE, SECTIONS, motion(SECTIONS), voxel_mm=VOXEL_MM, step=step)
-        for step in (0.125, 0.5, 1.0)
-    )
-    coarse_error, fine_error = np.std(coarse - finest), np.std(fine - finest)
-    assert fine_error < coarse_error / 2
-    assert coarse_error < 0.02 * finest.max()
-
-
 @pytest.mark.parametrize("basis", [ONE, SECTIONS], ids=["one", "sections"])
 def test_the_projection_is_the_residual_against_a_blank_radiograph(basis):
     rays, amplitude = rays_at(2.0), motion(basis)
@@ -116,22 +106,34 @@ WITH_CONTRACTION = SectionBasis(
 )
 
 
-@pytest.mark.parametrize("basis", [ONE, SECTIONS, WITH_CONTRACTION], ids=["one", "sections", "contraction"])
-@pytest.mark.parametrize(("angle", "step"), [(0.0, 1.0), (2.5, 1.0), (5.0, 0.7)])
-def test_normal_equations_agree_with_stored_sensitivities(basis, angle, step):
-    rays, amplitude = rays_at(angle), motion(basis, seed=3)
+COARSE = SCANNER.binned(2)
+COARSE_SHAPE = (COARSE.rows, COARSE.columns)
+
+
+def scaled(matrix, scale):
+    return matrix / np.outer(scale, scale)
+
+
+@pytest.mark.parametrize(
+    ("basis", "angle"),
+    [(ONE, 0.0), (ONE, 0.7), (SECTIONS, 0.0), (SECTIONS, 2.5), (WITH_CONTRACTION, 5.0)],
+    ids=["one, 0", "one, 0.7", "sections, 0", "sections, 2.5", "contraction, 5"],
+)
+def test_normal_equations_agree_with_stored_sensitivities(basis, angle):
+    rays, amplitude = rays_at(angle, COARSE), motion(basis, seed=3, size=0.5)
     rng = np.random.default_rng(4)
-    target = rng.normal(size=SHAPE).astype(np.float32)
-    weight = rng.uniform(0, 2, size=SHAPE).astype(np.float32)
-    found = normal_equations(textured(), rays, basis, amplitude, target, weight, voxel_mm=VOXEL_MM, step=step)
-    value, s = stored(textured(), rays, SHAPE, basis, amplitude, VOXEL_MM, step)
+    target = rng.normal(size=COARSE_SHAPE).astype(np.float32)
+    weight = rng.uniform(0, 2, size=COARSE_SHAPE).astype(np.float32)
+    found = normal_equations(textured(), rays, basis, amplitude, target, weight, voxel_mm=VOXEL_MM)
+    value, s = stored(textured(), rays, COARSE_SHAPE, basis, amplitude, VOXEL_MM)
     rho, w = value - target.ravel(), weight.ravel()
     np.testing.assert_allclose(found.residual.ravel(), rho, atol=1e-5 * value.max())
-    expected = s.T @ (w[:, None] * s)
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(found.matrix / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-4)
-    np.testing.assert_allclose(found.vector / scale, s.T @ (w * rho) / scale, atol=1e-4 * np.sqrt((w * rho**2).sum()))
     assert found.chi2 == pytest.approx((w * rho**2).sum(), rel=1e-5)
+    expected = s.T @ (w[:, None] * s)
+    # motion along the beam hardly shows: it is compared on a tenth of the best seen one's scale
+    scale = np.maximum(np.sqrt(np.diag(expected)), 0.1 * np.sqrt(np.diag(expected).max()))
+    np.testing.assert_allclose(scaled(found.matrix, scale), scaled(expected, scale), atol=2e-2)
+    np.testing.assert_allclose(found.vector / scale, s.T @ (w * rho) / scale, atol=5e-3 * np.sqrt((w * rho**2).sum()))
 
 
 def test_amplitudes_are_counted_in_the_voxel_that_is_named_whatever_the_volume_s():
@@ -157,26 +159,23 @@ CASES = [
 
 @pytest.mark.parametrize(("basis", "section", "kind"), CASES)
 def test_sensitivities_are_the_slope_of_the_projection(basis, section, kind):
-    """c = S^T rho with rho given, against central differences: S = -dP/da.
-
-    With a fine step along the ray, as its points move a little when the sample does.
-    """
+    """c = S^T rho with rho given, against central differences: S = -dP/da."""
     rays, amplitude, rho = rays_at(0.9), motion(basis, seed=5), smooth(6)
 
     def projected(change):
         trial = amplitude.copy()
         trial[section, kind] += change
-        return project(textured(3.0), rays, SHAPE, basis, trial, voxel_mm=VOXEL_MM, step=0.1)
+        return project(textured(3.0), rays, SHAPE, basis, trial, voxel_mm=VOXEL_MM)
 
     target = projected(0) - rho
-    found = normal_equations(textured(3.0), rays, basis, amplitude, target, EVEN, voxel_mm=VOXEL_MM, step=0.1)
+    found = normal_equations(textured(3.0), rays, basis, amplitude, target, EVEN, voxel_mm=VOXEL_MM)
     change = 0.02
     slope = (projected(-change).astype(float) - projected(change)) / (2 * change)
     expected = (slope * rho).sum()
     norm = np.sqrt((slope**2).sum() * (rho.astype(float) ** 2).sum())
     at = section * basis.shape[1] + kind
-    assert found.vector[at] == pytest.approx(expected, abs=1e-3 * norm)
-    assert np.sqrt(found.matrix[at, at]) == pytest.approx(np.sqrt((slope**2).sum()), rel=3e-3)
+    assert found.vector[at] == pytest.approx(expected, abs=3e-3 * norm)
+    assert np.sqrt(found.matrix[at, at]) == pytest.approx(np.sqrt((slope**2).sum()), rel=1e-2)
 
 
 @settings(deadline=None, max_examples=15)
@@ -187,10 +186,9 @@ def test_a_translation_by_whole_voxels_is_the_volume_shifted(shift, angle):
     amplitude = still(SECTIONS)
     amplitude[:, :3] = shift
     rays = rays_at(angle)
-    # a fine step, as the points along a ray lie elsewhere
-    warped = project(volume_of(values), rays, SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM, step=0.05)
-    shifted = project(volume_of(moved), rays, SHAPE, SECTIONS, still(SECTIONS), voxel_mm=VOXEL_MM, step=0.05)
-    np.testing.assert_allclose(warped, shifted, atol=2e-4 * shifted.max())
+    warped = project(volume_of(values), rays, SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM)
+    shifted = project(volume_of(moved), rays, SHAPE, SECTIONS, still(SECTIONS), voxel_mm=VOXEL_MM)
+    np.testing.assert_allclose(warped, shifted, atol=2e-6 * shifted.max())
 
 
 @settings(deadline=None, max_examples=15)
@@ -259,11 +257,10 @@ def test_a_sample_of_which_half_has_left_the_window_is_still_projected_rightly()
     amplitude = motion(SECTIONS)
     amplitude[:, 2] += 25
     rays = rays_at(0.3)
-    found = normal_equations(textured(), rays, SECTIONS, amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM)
-    value, s = stored(textured(), rays, SHAPE, SECTIONS, amplitude, VOXEL_MM)
-    assert (value == 0).mean() > 0.4
-    np.testing.assert_allclose(found.residual.ravel(), value, atol=1e-5 * value.max())
-    np.testing.assert_allclose(found.matrix, s.T @ s, atol=1e-4 * np.diag(s.T @ s).max())
+    found = project(textured(), rays, SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM)
+    expected = plane_sums(textured(), rays, SHAPE, SECTIONS, amplitude, VOXEL_MM)
+    assert (expected == 0).mean() > 0.4
+    np.testing.assert_allclose(found.ravel(), expected, atol=1e-5 * expected.max())
 
 
 def test_a_long_window_is_the_sum_of_its_parts():
