@@ -24,7 +24,7 @@ from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
 from pdvc.history import time_basis
 from pdvc.measurement import Measurement, Stage
-from pdvc.options import MeasureOptions, StageOptions
+from pdvc.options import MeasureOptions, StageOptions, resolved
 from pdvc.prior import Prior
 from pdvc.progress import Progress, silent
 from pdvc.projection import project
@@ -66,37 +66,41 @@ def measure(
     are used again only with the same experiment and options.
     """
     started = time.perf_counter()
+    options = resolved(options, experiment.geometry)
     window = _window(experiment.geometry, options)
     store = _Store(work, experiment)
     calibration, outline = _calibrated(experiment, options, store, progress)
     time_functions = time_basis(options.time, experiment.test)
     rigid, sections = _bases(experiment.geometry, window, outline.hull, options)
     reconstructing = time.perf_counter()
-    coarse = _images(experiment, calibration, outline, window, options.rigid.scale, options, store, progress)
-    fine = coarse
-    if options.deformation.scale != options.rigid.scale:
-        fine = _images(experiment, calibration, outline, window, options.deformation.scale, options, store, progress)
+    scales = {_scale(stage) for stage in (*options.rigid, *options.deformation)}
+    prepared = {
+        scale: _images(experiment, calibration, outline, window, scale, options, store, progress)
+        for scale in sorted(scales, reverse=True)
+    }
+    fine = prepared[1]
     solving = time.perf_counter()
-    zero = np.zeros((len(time_functions), *rigid.shape))
-    first = _solve(coarse.images, rigid, time_functions, zero, options.rigid, options, None, progress, "rigid")
-    start = sections.rigid(first.coefficients, rigid)
+
+    def solved(basis: SectionBasis, start: Floats, stage: StageOptions, name: str) -> Solution:
+        return _solve(prepared[_scale(stage)], basis, time_functions, start, stage, options, progress, name)
+
+    stages: list[Stage] = []
+    start = np.zeros((len(time_functions), *rigid.shape))
+    for stage in options.rigid:
+        solution = solved(rigid, start, stage, f"rigid, scale {stage.scale}")
+        stages.append(_stage("rigid", stage, rigid, time_functions, solution))
+        start = solution.coefficients
+    start = sections.rigid(start, rigid)
     standing = np.zeros((len(experiment.test), *sections.shape))
     initial = residuals(fine.images, sections, standing, progress=progress, task="initial residual")
     moved = np.einsum("ft,fjk->tjk", time_functions, start)
     after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
-    second = _solve(
-        fine.images,
-        sections,
-        time_functions,
-        start,
-        options.deformation,
-        options,
-        fine.noise_rms,
-        progress,
-        "deformation",
-    )
-    known = posterior(second.equations, time_functions, _prior(sections, options))
-    amplitude = np.einsum("ft,fjk->tjk", time_functions, second.coefficients)
+    for stage in options.deformation:
+        solution = solved(sections, start, stage, f"deformation, scale {stage.scale}")
+        stages.append(_stage("deformation", stage, sections, time_functions, solution))
+        start = solution.coefficients
+    known = posterior(solution.equations, time_functions, _prior(sections, options))
+    amplitude = np.einsum("ft,fjk->tjk", time_functions, solution.coefficients)
     amplitude[:, ~known.observed] = np.nan
     snr = _snr_of(fine.images)
     ended = time.perf_counter()
@@ -114,18 +118,15 @@ def measure(
         amplitude_std=np.where(known.observed[:, None], known.deviation, np.nan),
         data_share=np.where(known.observed[:, None], known.data_share, 0.0),
         observed=known.observed,
-        stages=(
-            _stage("rigid", options.rigid, rigid, time_functions, first),
-            _stage("deformation", options.deformation, sections, time_functions, second),
-        ),
+        stages=tuple(stages),
         snr_reprojection_db=fine.snr_reprojection_db,
         snr_initial_db=snr(initial),
         snr_rigid_db=snr(after_rigid),
-        snr_final_db=snr(second.equations.residual),
+        snr_final_db=snr(solution.equations.residual),
         snr_noise_db=fine.snr_noise_db,
         residual_initial=initial,
         residual_rigid=after_rigid,
-        residual_final=second.equations.residual,
+        residual_final=solution.equations.residual,
         seconds={
             "outline": reconstructing - started,
             "reconstruct": solving - reconstructing,
@@ -148,13 +149,7 @@ class _Prepared:
 
 def _window(geometry: ConeBeam, options: MeasureOptions) -> tuple[int, int, int, int]:
     """Return the used rows and columns: row_from, row_to, column_from, column_to."""
-    rows = round(geometry.rows * 100 / 954) if options.discard_rows is None else options.discard_rows
-    columns = round(geometry.columns * 60 / 432) if options.discard_columns is None else options.discard_columns
-    if 2 * rows >= geometry.rows or 2 * columns >= geometry.columns:
-        raise ValueError(
-            f"discard_rows, discard_columns: expected to leave some of {geometry.rows} x {geometry.columns} px, "
-            f"got {rows} and {columns} px on each side"
-        )
+    rows, columns = options.discard_rows or 0, options.discard_columns or 0
     return rows, geometry.rows - rows, columns, geometry.columns - columns
 
 
@@ -418,13 +413,12 @@ def _prior(basis: SectionBasis, options: MeasureOptions) -> Prior:
 
 
 def _solve(
-    images: Images,
+    prepared: _Prepared,
     basis: SectionBasis,
     time_functions: Floats,
     start: Floats,
     stage: StageOptions,
     options: MeasureOptions,
-    noise_rms: float | None,
     progress: Progress,
     name: str,
 ) -> Solution:
@@ -433,7 +427,7 @@ def _solve(
     def at(amplitude: Floats) -> Equations:
         nonlocal passes
         passes += 1
-        return linearise(images, basis, amplitude, progress=progress, task=f"{name}, pass {passes}")
+        return linearise(prepared.images, basis, amplitude, progress=progress, task=f"{name}, pass {passes}")
 
     prior = _prior(basis, options)
     if stage.solver == "pgd":
@@ -445,17 +439,22 @@ def _solve(
             most_modes=stage.most,
             passes_per_mode=stage.passes_per_mode,
             least_gain=stage.least_gain,
-            noise_rms=noise_rms,
+            noise_rms=prepared.noise_rms if basis.shape[0] > 1 else None,
         )
     return gauss_newton.solve(
         at, time_functions, start, prior, most_passes=stage.most, least_change_voxel=stage.least_change_voxel
     )
 
 
+def _scale(stage: StageOptions) -> int:
+    assert isinstance(stage.scale, int), "options are resolved"
+    return stage.scale
+
+
 def _stage(name: str, options: StageOptions, basis: SectionBasis, time_functions: Floats, solution: Solution) -> Stage:
     return Stage(
         name=name,
-        scale=options.scale,
+        scale=_scale(options),
         solver=options.solver,
         unknowns=len(time_functions) * basis.shape[0] * basis.shape[1],
         temporal=solution.temporal,

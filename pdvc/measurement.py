@@ -13,6 +13,7 @@ from pdvc.sections import SectionBasis
 
 Floats = NDArray[np.float64]
 FORMAT = 1
+"""Raised whenever a file of an older version can no longer be read."""
 
 
 class MeasurementError(ValueError):
@@ -144,15 +145,17 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
             **{f"seconds_{name}": value for name, value in m.seconds.items()},
         },
     )
-    for stage in m.stages:
-        name = stage.name
+    for n, stage in enumerate(m.stages):
+        name = f"stage{n}"
         data[f"{name}_temporal"] = ((f"{name}_mode", "step"), stage.temporal)
-        sections = "section" if stage.spatial.shape[1] == len(m.basis.height_mm) else f"{name}_section"
-        data[f"{name}_spatial"] = ((f"{name}_mode", sections, "motion"), stage.spatial, {"units": "voxel"})
+        # a rigid stage has one section, and may have fewer motions
+        own = stage.spatial.shape[1:] != m.basis.shape
+        axes = (f"{name}_section", f"{name}_motion") if own else ("section", "motion")
+        data[f"{name}_spatial"] = ((f"{name}_mode", *axes), stage.spatial, {"units": "voxel"})
         data[f"{name}_rms"] = (f"{name}_pass", stage.rms)
-        for key in ("scale", "solver", "unknowns", "stop_reason"):
+        for key in ("name", "scale", "solver", "unknowns", "stop_reason"):
             data.attrs[f"{name}_{key}"] = getattr(stage, key)
-    data.attrs["stages"] = ",".join(stage.name for stage in m.stages)
+    data.attrs["stages"] = len(m.stages)
     packed = {
         name: {"dtype": "int16", "scale_factor": 1e-4, "_FillValue": -32768}
         for name in ("residual_initial", "residual_rigid", "residual_final")
@@ -181,7 +184,7 @@ def _unpack(data: xr.Dataset) -> Measurement:
     attrs = data.attrs
     stages = tuple(
         Stage(
-            name=name,
+            name=str(attrs[f"{name}_name"]),
             scale=int(attrs[f"{name}_scale"]),
             solver=str(attrs[f"{name}_solver"]),
             unknowns=int(attrs[f"{name}_unknowns"]),
@@ -190,7 +193,7 @@ def _unpack(data: xr.Dataset) -> Measurement:
             rms=get(f"{name}_rms"),
             stop_reason=str(attrs[f"{name}_stop_reason"]),
         )
-        for name in str(attrs["stages"]).split(",")
+        for name in (f"stage{n}" for n in range(int(attrs["stages"])))
     )
     row_from, row_to, column_from, column_to = (int(value) for value in attrs["window"])
     return Measurement(

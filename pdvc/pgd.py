@@ -26,6 +26,8 @@ Floats = NDArray[np.float64]
 
 FIXED_POINT_TOLERANCE = 1e-6
 FIXED_POINT_MOST = 60
+WORTH_A_PASS = 0.005
+"""A mode is found again about itself as long as that lowers the residual by more than this share."""
 
 
 def solve(
@@ -43,7 +45,7 @@ def solve(
 
     `time_functions` (function, step) orthonormal; `start` (function, section, motion) in voxels. The paper computes
     each mode from one linearisation; with `passes_per_mode` above one a mode is found again, about itself, while
-    that lowers the residual by more than the share `least_gain`. A mode that lowers it by less is the last, and one
+    that helps. A mode that lowers the rms residual by less than the share `least_gain` is the last, and one
     that does not lower it, even shortened, is left out. `noise_rms` is gamma_f in grey levels, None where unknown.
     """
     shape = start.shape
@@ -68,7 +70,7 @@ def solve(
             gain = 1 - trial[2].rms / equations.rms
             a, b, equations = trial
             rms.append(equations.rms)
-            if gain < least_gain:
+            if gain < WORTH_A_PASS:
                 break
         if equations.rms >= before:
             reason = "no further mode lowers the residual: what is left lies outside the bases, or is noise"
@@ -161,9 +163,7 @@ def _improved(
 
 
 def _solved(matrix: Floats, vector: Floats) -> Floats:
-    """Solve a small symmetric system; directions without information stay at zero."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = linalg.eigh(matrix / np.outer(scale, scale))
-    keep = values > 1e-12 * values[-1]
-    parts = (vectors[:, keep].T @ (vector / scale)) / values[keep]
-    return np.asarray(vectors[:, keep] @ parts / scale)
+    """Solve a small symmetric system; the prior makes it positive definite."""
+    scale = 1 / np.sqrt(np.diag(matrix))
+    factor = linalg.cho_factor(matrix * scale[:, None] * scale, lower=True, overwrite_a=True, check_finite=False)
+    return np.asarray(linalg.cho_solve(factor, vector * scale, check_finite=False) * scale)

@@ -87,10 +87,13 @@ class SectionBasis:
     def displacement(self, amplitude: ArrayLike, points_mm: ArrayLike) -> Floats:
         """Return u, in voxels, at points x (point, 3) in mm of the *current* configuration.
 
-        `amplitude` (section, motion) in voxels; returns (point, 3).
+        `amplitude` (section, motion) in voxels; returns (point, 3), NaN where a section with NaN takes part.
         """
         points = np.asarray(points_mm, dtype=float)
-        maps = np.einsum("pj,jab->pab", self.weights(points[:, 2]), self.affine(amplitude))
+        weights, affine = self.weights(points[:, 2]), self.affine(amplitude)
+        maps = np.einsum("pj,jab->pab", weights, np.nan_to_num(affine))
+        # 0 x NaN is NaN, but a section that takes no part in a point must not spoil it
+        maps[(weights[:, np.isnan(affine).any(axis=(1, 2))] > 0).any(axis=1)] = np.nan
         return np.einsum("pab,pb->pa", maps[..., :3], points) + maps[..., 3]
 
     def rigid(self, amplitude: ArrayLike, single: SectionBasis) -> Floats:

@@ -34,7 +34,7 @@ class Specimen(Settings):
     """ligament section along the specimen's y axis, mm"""
     fillet_radius_mm: Positive = 20.5
     """radius of the fillet that thins the ligament, mm"""
-    thinned: Literal["x", "y", "both"] = "x"
+    thinned: Literal["x", "y", "both"] = "both"
     """which half widths follow the fillet: x, y or both"""
     grip_width_mm: Positive = 3.0
     """size of a thinned side in the grips, where the fillet has ended, mm"""

@@ -126,7 +126,6 @@ def test_a_description_reads_back_as_it_was_written(tmp_path_factory, record):
             beam_hardening=(1.0, 0.25, 1e-3),
             section_motions=("translation_z", "contraction"),
             time=(Force(), Angle(harmonics=2), Polynomial(degree=3), Ramp(start=9, powers=(1, 3)), Splines(degree=1)),
-            deformation=StageOptions(solver="gauss-newton"),
         ),
     ],
     ids=["defaults", "stage", "all changed"],

@@ -14,7 +14,7 @@ from pdvc.experiment import Experiment
 from pdvc.measurement import Measurement
 from validation.axis import TruePoints, axis_history, nan_mean
 from validation.pictures import pictures
-from validation.scores import Scores, mean_snr
+from validation.scores import Scores, mean_snr, modes_found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ def _page(measurement: Measurement, scores: Scores | None, shown: list[dict[str,
 def summary_rows(measurement: Measurement, scores: Scores | None) -> list[Row]:
     """Return the lines of the summary, beside the paper's numbers where it has one."""
     snr = mean_snr(measurement)
-    modes = {stage.name: stage.modes for stage in measurement.stages}
+    modes = modes_found(measurement)
     strain = scores.max_strain_measured if scores else _largest_strain(measurement)
     rows = [
         Row(name="SNR re-projection, dB", here=_number(snr.reprojection, 2), paper="21.70"),
@@ -84,8 +84,8 @@ def summary_rows(measurement: Measurement, scores: Scores | None) -> list[Row]:
         Row(name="SNR after rigid motions, dB", here=_number(snr.rigid, 2), paper="25.4"),
         Row(name="SNR final, dB", here=_number(snr.final, 2), paper="26.7"),
         Row(name="SNR that noise alone would leave, dB", here=_number(snr.noise_limit, 2)),
-        Row(name="rigid modes", here=str(modes.get("rigid", 0)), paper="8"),
-        Row(name="deformation modes", here=str(modes.get("deformation", 0)), paper="4"),
+        Row(name="rigid modes", here=str(modes.rigid), paper="8"),
+        Row(name="deformation modes", here=str(modes.deformation), paper="4"),
         Row(name="steps", here=str(len(measurement.angle_rad)), paper="127"),
         Row(name="unknowns", here=str(measurement.unknowns), paper="630"),
         Row(name="extension, voxel", here=_number(_extension(measurement), 1), paper="about 15"),

@@ -163,7 +163,7 @@ def score(
         steps=len(measurement.angle_rad),
         unknowns=measurement.unknowns,
         snr_db=mean_snr(measurement),
-        modes=_modes(measurement),
+        modes=modes_found(measurement),
         error_voxel=errors.rms(),
         bias_voxel=errors.bias(),
         random_voxel=errors.random(),
@@ -192,9 +192,12 @@ def mean_snr(measurement: Measurement) -> Snr:
     )
 
 
-def _modes(measurement: Measurement) -> Modes:
-    found = {stage.name: stage.modes for stage in measurement.stages}
-    return Modes(rigid=found.get("rigid", 0), deformation=found.get("deformation", 0))
+def modes_found(measurement: Measurement) -> Modes:
+    """Count the modes of the rigid stage, and of all section stages together."""
+    found = {"rigid": 0, "deformation": 0}
+    for stage in measurement.stages:
+        found[stage.name] += stage.modes
+    return Modes(**found)
 
 
 def _rms(values: Floats, axis: int | tuple[int, ...] | None = None) -> Floats:
