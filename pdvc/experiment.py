@@ -13,6 +13,8 @@ A folder is readable without this software::
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -245,11 +247,11 @@ class StackWriter:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._map is None:
-            return
-        self._save()
-        self._map = None
-        if self.done == self._shape[0]:
+        if self._map is not None:
+            self._save()
+            self._map = None
+        # a process that was killed between the last image and its name left only the naming to do
+        if self.done == self._shape[0] and self._partial.exists():
             self._partial.replace(self.path)
             self._count.unlink()
 
@@ -282,7 +284,7 @@ def _series(folder: Path, name: str, entry: StackEntry, key: str, geometry: Cone
 
 def _stack(path: Path, geometry: ConeBeam) -> NDArray[np.uint16]:
     counts = _read_tiff(path)
-    if counts.dtype != np.uint16:
+    if counts.dtype.newbyteorder("=") != np.uint16:  # ImageJ writes big-endian
         raise ExperimentError(f"{path}: expected uint16 counts, found {counts.dtype}")
     if counts.ndim == 2:
         counts = counts[None]
@@ -293,12 +295,26 @@ def _stack(path: Path, geometry: ConeBeam) -> NDArray[np.uint16]:
     return counts
 
 
+def _declared_images(tiff: tifffile.TiffFile) -> int | None:
+    """Return how many images the file's own notes promise, as tifffile and ImageJ write them; None without."""
+    for notes in tiff.shaped_metadata or ():
+        if "shape" in notes:
+            return int(np.prod(notes["shape"][:-2]))
+    images = (tiff.imagej_metadata or {}).get("images")
+    return None if images is None else int(images)
+
+
 def _read_tiff(path: Path) -> NDArray[Any]:
     if not path.is_file():
         raise ExperimentError(f"{path}: expected a TIFF stack, found none")
     try:
         with tifffile.TiffFile(path) as tiff:
+            if len(tiff.series) != 1:
+                raise ExperimentError(f"{path}: expected one stack of equal images, found {len(tiff.series)} series")
             series = tiff.series[0]
+            declared = _declared_images(tiff)
+            if declared is not None and declared != len(tiff.pages) and declared != len(series):
+                raise ExperimentError(f"{path}: truncated: expected {declared} images, found {len(tiff.pages)}")
             needed = series.dataoffset + series.nbytes if series.dataoffset is not None else 0
             if path.stat().st_size < needed:
                 raise ExperimentError(f"{path}: truncated: expected {needed} bytes, found {path.stat().st_size}")
@@ -307,7 +323,7 @@ def _read_tiff(path: Path) -> NDArray[Any]:
             return series.asarray()
     except ExperimentError:
         raise
-    except (tifffile.TiffFileError, ValueError, OSError, IndexError, KeyError) as error:
+    except (tifffile.TiffFileError, ValueError, OSError, LookupError, struct.error, zlib.error) as error:
         raise ExperimentError(f"{path}: expected a TIFF stack, cannot read it: {error}") from None
 
 

@@ -15,7 +15,7 @@ from scipy import linalg
 
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior
-from pdvc.solution import Solution, evaluated, shortened
+from pdvc.solution import SHORTER, Solution, evaluated, lowers
 
 Floats = NDArray[np.float64]
 
@@ -52,12 +52,15 @@ def solve(
     reason = f"{most_passes} passes done, the most allowed: allow more, the solution still moves"
     for _ in range(most_passes):
         change = _change(equations, time_functions, coefficients, prior)
-        step, trial = shortened(at, coefficients, change, equations)
-        if trial is None:
+        for step in SHORTER:
+            moved = coefficients + step * change
+            trial = at(moved)
+            if lowers(equations, coefficients, trial, moved, prior):
+                break
+        else:
             reason = "no step lowers the residual further: converged, within the precision of the sums"
             break
-        coefficients = coefficients + step * change
-        equations = trial
+        coefficients, equations = moved, trial
         rms.append(equations.rms)
         size = step * float(np.sqrt((change**2).sum() / np.prod(shape[1:])))
         if size < least_change_voxel:
@@ -74,7 +77,7 @@ def solve(
 
 
 def _change(equations: Equations, time_functions: Floats, coefficients: Floats, prior: Prior) -> Floats:
-    ridge = np.tile(equations.rms**2 * prior.precision(), len(coefficients))
+    ridge = np.tile(max(equations.rms, 1e-7) ** 2 * prior.precision(), len(coefficients))
     matrix = hessian(equations, time_functions)
     matrix[np.diag_indices_from(matrix)] += ridge
     vector = (time_functions @ equations.vector).ravel() - ridge * coefficients.ravel()

@@ -46,7 +46,8 @@ class Angle(Settings):
     def functions(self, series: Series) -> Floats:
         """Return (2 harmonics, step)."""
         k = np.arange(1, self.harmonics + 1)[:, None] * series.angle_rad
-        return np.concatenate([np.sin(k), np.cos(k)])
+        # the sine of half turns is a rounding error, not a function
+        return np.round(np.concatenate([np.sin(k), np.cos(k)]), 12)
 
 
 class Polynomial(Settings):
@@ -114,7 +115,7 @@ class Fourier(Settings):
     def functions(self, series: Series) -> Floats:
         """Return (2 harmonics, step)."""
         phase = 2 * np.pi * np.arange(1, self.harmonics + 1)[:, None] * np.arange(len(series)) / self.period
-        return np.concatenate([np.sin(phase), np.cos(phase)])
+        return np.round(np.concatenate([np.sin(phase), np.cos(phase)]), 12)
 
 
 class Steps(Settings):

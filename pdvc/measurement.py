@@ -156,14 +156,17 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
         for key in ("name", "scale", "solver", "unknowns", "stop_reason"):
             data.attrs[f"{name}_{key}"] = getattr(stage, key)
     data.attrs["stages"] = len(m.stages)
-    packed = {
-        name: {"dtype": "int16", "scale_factor": 1e-4, "_FillValue": -32768}
-        for name in ("residual_initial", "residual_rigid", "residual_final")
-    }
+    packed = {name: _packing(data[name].values) for name in data if str(name).startswith("residual_")}
     partial = path.with_name(path.name + ".partial")
     path.parent.mkdir(parents=True, exist_ok=True)
     data.to_netcdf(partial, engine="h5netcdf", encoding=packed)
     partial.replace(path)
+
+
+def _packing(values: NDArray[np.float32]) -> dict[str, object]:
+    """Return how to store grey levels as 16-bit integers: in steps of 1e-4, or coarser ones if they need it."""
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    return {"dtype": "int16", "scale_factor": max(1e-4, largest / 32767), "_FillValue": -32768}
 
 
 def read_measurement(path: Path) -> Measurement:
@@ -172,6 +175,8 @@ def read_measurement(path: Path) -> Measurement:
         raise MeasurementError(f"{path}: expected a measurement file, found none")
     try:
         with xr.open_dataset(path, engine="h5netcdf") as data:
+            if data.attrs.get("format") != FORMAT:
+                raise ValueError(f"found format {data.attrs.get('format')}")
             return _unpack(data.load())
     except (OSError, KeyError, ValueError) as error:
         raise MeasurementError(f"{path}: expected a measurement of format {FORMAT}: {error}") from None

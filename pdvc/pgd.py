@@ -20,7 +20,7 @@ from scipy import linalg
 
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior
-from pdvc.solution import Solution, evaluated
+from pdvc.solution import SHORTER, Solution, evaluated, lowers
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def solve(
         a, b = np.zeros(len(start)), np.zeros(coefficients.shape[1])
         for _ in range(passes_per_mode):
             found = find_mode(equations, time_functions, coefficients, prior, now=(a, b))
-            trial = _improved(at, coefficients, (a, b), found, equations)
+            trial = _improved(at, coefficients, (a, b), found, equations, prior)
             if trial is None:
                 break
             gain = 1 - trial[2].rms / equations.rms
@@ -72,7 +72,7 @@ def solve(
             rms.append(equations.rms)
             if gain < WORTH_A_PASS:
                 break
-        if equations.rms >= before:
+        if not b.any():
             reason = "no further mode lowers the residual: what is left lies outside the bases, or is noise"
             break
         coefficients = coefficients + np.outer(a, b)
@@ -105,7 +105,7 @@ def find_mode(
     mode `now` already added, the mode that replaces it is returned. Without one, every time function alone is
     tried as a start, and the best is followed.
     """
-    ridge = equations.rms**2 * prior.precision()
+    ridge = max(equations.rms, 1e-7) ** 2 * prior.precision()
     vectors = equations.vector
     if now is not None and now[1].any():
         # linear about the present mode: chi2(m) = m B m - 2 m (c + B m_now), with m = alpha b
@@ -121,10 +121,12 @@ def find_mode(
     for _ in range(FIXED_POINT_MOST):
         before = np.outer(a, b)
         b = _solved(*_spatial(equations.matrix, vectors, time_functions, coefficients, ridge, a))
+        if not b.any():
+            break
         a = _solved(*_temporal(equations.matrix, vectors, time_functions, coefficients, ridge, b))
         size = np.linalg.norm(a)
         if size == 0:
-            break
+            return a, np.zeros_like(b)
         a, b = a / size, b * size
         if np.linalg.norm(np.outer(a, b) - before) <= FIXED_POINT_TOLERANCE * np.linalg.norm(b):
             break
@@ -150,14 +152,21 @@ def _temporal(
 
 
 def _improved(
-    at: Callable[[Floats], Equations], coefficients: Floats, now: Mode, found: Mode, equations: Equations
+    at: Callable[[Floats], Equations],
+    coefficients: Floats,
+    now: Mode,
+    found: Mode,
+    equations: Equations,
+    prior: Prior,
 ) -> tuple[Floats, Floats, Equations] | None:
     """Try the mode found, then ways half and a quarter towards it; None where none lowers the residual."""
-    for share in (1.0, 0.5, 0.25):
+    standing = coefficients + np.outer(*now)
+    for share in SHORTER:
         # a mixture of two modes is none, so that the way from one to the other keeps the new history
         a, b = found[0], share * found[1] + (1 - share) * (now[0] @ found[0]) * now[1]
-        trial = at(coefficients + np.outer(a, b))
-        if trial.rms < equations.rms:
+        moved = coefficients + np.outer(a, b)
+        trial = at(moved)
+        if lowers(equations, standing, trial, moved, prior):
             return a, b, trial
     return None
 

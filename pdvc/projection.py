@@ -207,13 +207,13 @@ def _band_sections(
     bands = -(-rows // BAND_ROWS)
     first = np.arange(bands) * BAND_ROWS
     row = np.stack([first, np.minimum(first + BAND_ROWS, rows) - 1])[..., None]
-    column = np.array([0, columns - 1])
+    column = np.arange(columns)
     slope = [rays[1, i] + row * rays[2, i] + column * rays[3, i] - rays[0, i] for i in range(3)]
     rise = slope[2] / np.hypot(slope[0], slope[1])
     near = np.hypot(*(box.mean(axis=0)[:2] - rays[0, :2]))
     reach = np.linalg.norm(box[1, :2] - box[0, :2]) / 2 + 1
-    # half a percent more: rays at the edges are longer than their distance to the axis
-    z = rays[0, 2] + np.stack([rise * (0.995 * near - reach), rise * (1.005 * near + reach)])
+    # every point of the box is, seen from above, between these two distances from the source
+    z = rays[0, 2] + np.stack([rise * max(near - reach, 0.0), rise * (near + reach)])
     low = np.searchsorted(heights, z.min(axis=(0, 1, 3)) - 1, side="right") - 1
     high = np.searchsorted(heights, z.max(axis=(0, 1, 3)) + 1, side="left")
     low = np.clip(low, 0, len(heights) - 1)
@@ -330,11 +330,12 @@ def _clip_box(box, base, along):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _clip_hull(place, support, normals, limit, a, b, path):  # type: ignore[no-untyped-def]
+def _clip_hull(place, support, normals, limit, layers, a, b, path):  # type: ignore[no-untyped-def]
     """Shrink [a, b] to where the moved ray x'(l), taken as straight between a and b, meets the hull.
 
-    Written without branches over the half-planes, in single precision, so that they are clipped together;
-    `limit` (direction,) is scratch.
+    It also stays inside the volume's first and last layer but one: where the volume is cut in height, the step from
+    the sample to the empty outermost layer is no texture. Written without branches over the half-planes, in single
+    precision, so that they are clipped together; `limit` (direction,) is scratch.
     """
     ax, bx, cx, ay, by, cy, az, bz, cz = path
     xa, ya, za = _f(ax + a * (bx + a * cx)), _f(ay + a * (by + a * cy)), az + a * (bz + a * cz)
@@ -348,6 +349,13 @@ def _clip_hull(place, support, normals, limit, a, b, path):  # type: ignore[no-u
         for k in range(len(limit)):
             limit[k] = max(limit[k], support[slab, k])
     low, high = _f(0), _f(1)
+    for da, db in ((za - 1, zb - 1), (layers - 2 - za, layers - 2 - zb)):
+        if da < 0 and db < 0:
+            return a, a
+        if da < 0:
+            low = max(low, _f(da / (da - db)))
+        elif db < 0:
+            high = min(high, _f(da / (da - db)))
     for k in range(len(limit)):
         da = limit[k] - (normals[0, k] * xa + normals[1, k] * ya)
         db = limit[k] - (normals[0, k] * xb + normals[1, k] * yb)
@@ -497,6 +505,8 @@ def _walk_band(  # type: ignore[no-untyped-def]
             for i in range(3):
                 # l = 0 where the ray passes the middle of the sample, so that single precision is enough
                 base[i] = rays[0, i] + reach * along[i]
+            # one axis for the whole ray: sums of neighbouring intervals must be over the same planes
+            along_x = abs(along[0]) >= abs(along[1])
             value = 0.0
             a, end = _clip_box(box, base, along)
             k_first, k_last = n, -1
@@ -520,10 +530,9 @@ def _walk_band(  # type: ignore[no-untyped-def]
                 else:
                     j1 = j0
                 path = _quadratic(maps[j0], maps[j1], base, along, s0, s1)
-                inner_a, inner_b = _clip_hull(place, support, normals, limit16, a, b, path)
+                inner_a, inner_b = _clip_hull(place, support, normals, limit16, shape[0], a, b, path)
                 if inner_a < inner_b:
                     ax, bx, cx, ay, by, cy, az, bz, cz = path
-                    along_x = abs(bx) >= abs(by)
                     if along_x:
                         turned, strides, limit, count = (ax, bx, cx, ay, by, cy, az, bz, cz), to_x, most_x, nx
                     else:
@@ -555,7 +564,8 @@ def _walk_band(  # type: ignore[no-untyped-def]
             rho = value - target[row, column]
             residual[row, column] = rho
             w = weight[row, column]
-            chi2[band] += w * rho * rho
+            if w > 0:
+                chi2[band] += w * rho * rho
             if k_last >= 0:
                 first, last = (k_first - low) * motions, (k_last + 1 - low) * motions
                 if w > 0:

@@ -100,7 +100,7 @@ class SectionBasis:
         """Return the amplitudes of this basis that reproduce a motion of `single`, a basis of one section.
 
         `amplitude` (..., 1, motion of single) in voxels; returns (..., section, motion). Exact, because hat
-        functions reproduce linear fields; motions that `single` lacks stay at zero.
+        functions reproduce linear fields.
         """
         moved = single.affine(amplitude)[..., 0, :, :]
         result = np.zeros((*moved.shape[:-2], *self.shape))
@@ -113,4 +113,6 @@ class SectionBasis:
             elif kind == "rotation":
                 row, column = {"x": (2, 1), "y": (0, 2), "z": (1, 0)}[axis]
                 result[..., k] = gradient[..., row, column][..., None]
+            else:
+                result[..., k] = gradient[..., 0, 0][..., None]
         return result

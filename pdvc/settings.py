@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any, Self
@@ -22,7 +23,9 @@ class Settings(BaseModel):
     which `template` prints as a comment.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        frozen=True, strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
     @classmethod
     def parse(cls, values: dict[str, Any], *, where: str) -> Self:
@@ -31,7 +34,8 @@ class Settings(BaseModel):
         Raises SettingsError with one line for each wrong key.
         """
         try:
-            return cls.model_validate(values)
+            # strict validation takes a list for a tuple only from JSON
+            return cls.model_validate_json(json.dumps(values, default=str))
         except ValidationError as error:
             lines = [_explain(detail) for detail in error.errors()]
             raise SettingsError(f"{where}: " + "; ".join(lines)) from None

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.equations import Equations, Linearise
+from pdvc.prior import Prior
 
 Floats = NDArray[np.float64]
 
@@ -42,12 +43,14 @@ def evaluated(linearise: Linearise, time_functions: Floats, shape: tuple[int, ..
     return at
 
 
-def shortened(
-    at: Callable[[Floats], Equations], coefficients: Floats, change: Floats, now: Equations
-) -> tuple[float, Equations | None]:
-    """Try the whole change, a half and a quarter; return the first that lowers the residual, else None."""
-    for step in (1.0, 0.5, 0.25):
-        trial = at(coefficients + step * change)
-        if trial.rms < now.rms:
-            return step, trial
-    return 0.0, None
+SHORTER = (1.0, 0.5, 0.25)
+"""Shares of a change that are tried in turn, until one lowers what is minimised."""
+
+
+def lowers(now: Equations, coefficients: Floats, trial: Equations, moved: Floats, prior: Prior) -> bool:
+    """Return whether chi2 + rms^2 sum (amplitude / deviation)^2 falls, with rms that of `now`.
+
+    `coefficients` and `moved` (function, section * motion) belong to `now` and `trial`.
+    """
+    believed = now.rms**2 * float((prior.precision() * (moved**2 - coefficients**2)).sum())
+    return bool(trial.chi2.sum() + believed < now.chi2.sum())

@@ -121,8 +121,8 @@ def _register(field, rays, heights, maps, corner, out):  # type: ignore[no-untyp
             r = np.sum(hit * down) / pitch2 + corner[0]
             c = np.sum(hit * right) / pitch2 + corner[1]
             out[row, column] = 0.0
-            if 0 <= r < field.shape[0] - 1 and 0 <= c < field.shape[1] - 1:
-                i, j = int(r), int(c)
+            if -0.01 <= r <= field.shape[0] - 0.99 and -0.01 <= c <= field.shape[1] - 0.99:
+                i, j = min(max(int(r), 0), field.shape[0] - 2), min(max(int(c), 0), field.shape[1] - 2)
                 fr, fc = r - i, c - j
                 upper = (1 - fc) * field[i, j] + fc * field[i, j + 1]
                 lower = (1 - fc) * field[i + 1, j] + fc * field[i + 1, j + 1]

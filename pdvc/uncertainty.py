@@ -45,7 +45,8 @@ def posterior(equations: Equations, time_functions: Floats, prior: Prior) -> Pos
     shape = prior.deviation_voxel.shape
     functions, steps = time_functions.shape
     size = shape[0] * shape[1]
-    gamma2 = equations.rms**2
+    # noise-free data still leave a covariance, as small as single precision
+    gamma2 = max(equations.rms, 1e-7) ** 2
     precision = prior.precision()
     matrix = hessian(equations, time_functions)
     matrix[np.diag_indices_from(matrix)] += np.tile(gamma2 * precision, functions)
