@@ -138,9 +138,9 @@ def _fit(
     window = geometry.cropped(middle.start, middle.stop, 0, geometry.columns)
     lengths, attenuations = [], []
     for i in np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int)):
-        rays = ray_vectors(window, angle_rad[i]).stacked()[0]
+        rays = ray_vectors(window, angle_rad[i]).stacked()
         shape = (window.rows, window.columns)
-        length = project(volume, rays, shape, still, np.zeros(still.shape), voxel_mm=grid.voxel_mm)
+        length = project(volume, rays, shape, still, np.zeros((1, *still.shape)), voxel_mm=grid.voxel_mm)
         lengths.append(length.ravel())
         attenuations.append(views[i][middle].ravel())
     length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)

@@ -17,6 +17,8 @@ from pdvc.volume import Volume
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+STEPS_AT_ONCE = 8
+
 
 @dataclass(frozen=True, kw_only=True)
 class Images:
@@ -72,18 +74,19 @@ def linearise(
     steps, size = len(images.grey), basis.shape[0] * basis.shape[1]
     matrix, vector, chi2 = np.empty((steps, size, size)), np.empty((steps, size)), np.empty(steps)
     residual = np.empty_like(images.grey)
-    for t in range(steps):
+    for part in _parts(steps):
         result = normal_equations(
             images.volume,
-            images.rays[t],
+            images.rays[part],
             basis,
-            amplitude[t],
-            _target(images, basis, amplitude, t),
-            images.weight[t % len(images.weight)],
+            amplitude[part],
+            _target(images, basis, amplitude, part),
+            images.weight if len(images.weight) == 1 else images.weight[part],
             voxel_mm=images.voxel_mm,
         )
-        matrix[t], vector[t], chi2[t], residual[t] = result.matrix, result.vector, result.chi2, result.residual
-        progress(task, t + 1, steps)
+        matrix[part], vector[part], chi2[part] = result.matrix, result.vector, result.chi2
+        residual[part] = result.residual
+        progress(task, part.stop, steps)
     return Equations(matrix=matrix, vector=vector, chi2=chi2, residual=residual, pixels=images.used_pixels)
 
 
@@ -92,24 +95,23 @@ def residuals(
 ) -> Image:
     """Return the residual fields (step, row, column) alone, at half the cost of a full pass."""
     result = np.empty_like(images.grey)
-    for t in range(len(images.grey)):
-        shape = (images.grey.shape[1], images.grey.shape[2])
-        model = project(
-            images.volume,
-            images.rays[t],
-            shape,
-            basis,
-            amplitude[t],
-            voxel_mm=images.voxel_mm,
-        )
-        result[t] = model - _target(images, basis, amplitude, t)
-        progress(task, t + 1, len(images.grey))
+    shape = (images.grey.shape[1], images.grey.shape[2])
+    for part in _parts(len(images.grey)):
+        model = project(images.volume, images.rays[part], shape, basis, amplitude[part], voxel_mm=images.voxel_mm)
+        result[part] = model - _target(images, basis, amplitude, part)
+        progress(task, part.stop, len(images.grey))
     return result
 
 
-def _target(images: Images, basis: SectionBasis, amplitude: Floats, t: int) -> Image:
-    """Return what the bare projection should equal: the radiograph plus the registered systematic residual."""
+def _parts(steps: int) -> list[slice]:
+    """Return the ranges of steps that are worked on together: enough of them to keep all threads busy."""
+    return [slice(start, min(start + STEPS_AT_ONCE, steps)) for start in range(0, steps, STEPS_AT_ONCE)]
+
+
+def _target(images: Images, basis: SectionBasis, amplitude: Floats, part: slice) -> Image:
+    """Return what the bare projections should equal: the radiographs plus the registered systematic residual."""
     if images.systematic is None:
-        return images.grey[t]
-    left = images.systematic.registered(t, images.rays[t], basis, amplitude[t], images.voxel_mm)
-    return np.asarray(images.grey[t] + left, dtype=np.float32)
+        return images.grey[part]
+    left = images.systematic.registered(part, images.rays[part], basis, amplitude[part], images.voxel_mm)
+    left += images.grey[part]
+    return left

@@ -305,12 +305,12 @@ def _systematic(
         grey = view(int(i))
         model = project(
             volume,
-            rays[n],
+            rays[n : n + 1],
             (geometry.rows, geometry.columns),
             still,
-            np.zeros(still.shape),
+            np.zeros((1, *still.shape)),
             voxel_mm=geometry.voxel_mm,
-        )
+        )[0]
         fields[n, reached] = (model - grey)[reached]
         snr[n] = snr_db(grey[window], fields[n][window], np.ones_like(grey[window], dtype=bool))
         progress("re-projection", n + 1, len(needed))

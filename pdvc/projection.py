@@ -1,6 +1,6 @@
-"""Warped projection, residual and projected sensitivities of a radiograph, reduced as they are found.
+"""Warped projection, residual and projected sensitivities of radiographs, reduced as they are found.
 
-For one step, with F the reference volume, u the trial motion and a ray x(s) from the source to pixel r,
+For each step, with F the reference volume, u the trial motion and a ray x(s) from the source to pixel r,
 
     P[F~](r)  = int F(x - u(x)) ds                              grey levels
     rho(r)    = P[F~](r) - g(r)                                 Eq. 2
@@ -51,16 +51,16 @@ _NOWHERE = np.float32(-1e6)
 
 @dataclass(frozen=True, kw_only=True)
 class StepEquations:
-    """Hold what one radiograph says about its step's section amplitudes."""
+    """Hold what radiographs say about the section amplitudes of their steps."""
 
     matrix: Floats
-    """B (section * motion, section * motion), (grey level / voxel)^2."""
+    """B (step, section * motion, section * motion), (grey level / voxel)^2."""
     vector: Floats
-    """c (section * motion,), grey level^2 / voxel."""
-    chi2: float
-    """Weighted sum of squared residuals, grey level^2."""
+    """c (step, section * motion), grey level^2 / voxel."""
+    chi2: Floats
+    """Weighted sum of squared residuals (step,), grey level^2."""
     residual: Image
-    """rho (row, column), grey levels, in every pixel of the window, whatever its weight."""
+    """rho (step, row, column), grey levels, in every pixel of the window, whatever its weight."""
 
 
 def normal_equations(
@@ -73,15 +73,13 @@ def normal_equations(
     *,
     voxel_mm: float,
 ) -> StepEquations:
-    """Compare a radiograph with the moved volume, and return its normal equations.
+    """Compare radiographs with the moved volume, and return their normal equations.
 
-    `rays` (4, 3) in mm as of RayVectors.stacked, for the window that `target` (row, column) covers;
-    `amplitude` (section, motion) in voxels of `voxel_mm`; `weight` (row, column), zero for unused
-    pixels.
+    `rays` (step, 4, 3) in mm as of RayVectors.stacked, for the window that `target` (step, row, column) covers;
+    `amplitude` (step, section, motion) in voxels of `voxel_mm`; `weight` (step, row, column), or (1, row, column)
+    for all steps, zero for unused pixels. Raises ValueError for amplitudes that are not finite or of another shape.
     """
-    equations = _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, True)
-    assert equations is not None
-    return equations
+    return _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, True)
 
 
 def project(
@@ -93,9 +91,9 @@ def project(
     *,
     voxel_mm: float,
 ) -> Image:
-    """Return the radiograph P[F~] (row, column), grey levels, of the moved volume."""
-    blank = np.zeros(shape, dtype=np.float32)
-    return _walk(volume, rays, basis, amplitude, blank, blank, voxel_mm, False).residual
+    """Return the radiographs P[F~] (step, row, column), grey levels, of the moved volume; arguments as above."""
+    blank = np.zeros((len(rays), *shape), dtype=np.float32)
+    return _walk(volume, rays, basis, amplitude, blank, blank[:1], voxel_mm, False).residual
 
 
 def _walk(
@@ -108,31 +106,31 @@ def _walk(
     voxel_mm: float,
     sensitivities: bool,
 ) -> StepEquations:
-    """Prepare one step in index coordinates of the volume, walk its rays, and add the bands in order."""
-    grid = volume.grid
-    if amplitude.shape != basis.shape or not np.isfinite(amplitude).all():
-        raise ValueError(f"amplitude: expected finite {basis.shape}, got {amplitude.shape}")
+    """Prepare the steps in index coordinates of the volume, walk their rays, and add the bands in order."""
+    grid, steps = volume.grid, len(rays)
+    if amplitude.shape != (steps, *basis.shape) or not np.isfinite(amplitude).all():
+        raise ValueError(f"amplitude: expected finite {(steps, *basis.shape)}, got {amplitude.shape}")
     origin = np.array(grid.origin_mm)
     index_rays = rays / grid.voxel_mm
-    index_rays[:2] -= origin / grid.voxel_mm
+    index_rays[:, :2] -= origin / grid.voxel_mm
     heights = (basis.height_mm - origin[2]) / grid.voxel_mm
     ratio = voxel_mm / grid.voxel_mm
     maps = _indexed(basis.affine(amplitude), origin, grid.voxel_mm) * ratio
     patterns = _indexed(basis.patterns(), origin, grid.voxel_mm) * ratio
-    slabs = _hull_in_index(volume)
-    box = _moved_box(volume, heights, maps)
-    low, span = _band_sections(index_rays, target.shape, heights, box)
-    bands = len(low)
-    size = span * basis.shape[1] if sensitivities else 0
-    matrices, vectors = np.zeros((bands, size, size)), np.zeros((bands, size))
-    chi2 = np.zeros(bands)
+    place, support = _hull_in_index(volume)
+    boxes = np.stack([_moved_box(volume, heights, each) for each in maps])
+    bands = [_band_sections(index_rays[t], target.shape[1:], heights, boxes[t]) for t in range(steps)]
+    low = np.stack([lowest for lowest, _ in bands])
+    size = max(span for _, span in bands) * basis.shape[1] if sensitivities else 0
+    matrices, vectors = np.zeros((*low.shape, size, size)), np.zeros((*low.shape, size))
+    chi2 = np.zeros(low.shape)
     residual = np.empty(target.shape, dtype=np.float32)
     _walk_bands(
         volume.values.reshape(-1),
         np.array(grid.shape, dtype=np.int64),
-        slabs[0],
-        slabs[1],
-        box,
+        place,
+        support,
+        boxes,
         index_rays,
         heights,
         maps,
@@ -148,15 +146,15 @@ def _walk(
         residual,
     )
     total = basis.shape[0] * basis.shape[1] if sensitivities else 0
-    matrix, vector = np.zeros((total, total)), np.zeros(total)
-    for band in range(bands if sensitivities else 0):
-        first = low[band] * basis.shape[1]
-        here = slice(first, min(first + size, total))
-        count = here.stop - here.start
-        matrix[here, here] += matrices[band, :count, :count]
-        vector[here] += vectors[band, :count]
-    matrix += np.tril(matrix, -1).T
-    return StepEquations(matrix=matrix, vector=vector, chi2=float(chi2.sum()), residual=residual)
+    matrix, vector = np.zeros((steps, total, total)), np.zeros((steps, total))
+    for t, band in np.ndindex(low.shape if sensitivities else (0, 0)):
+        first = int(low[t, band]) * basis.shape[1]
+        count = min(size, total - first)
+        here = slice(first, first + count)
+        matrix[t, here, here] += matrices[t, band, :count, :count]
+        vector[t, here] += vectors[t, band, :count]
+    matrix += np.tril(matrix, -1).transpose(0, 2, 1)
+    return StepEquations(matrix=matrix, vector=vector, chi2=chi2.sum(axis=1), residual=residual)
 
 
 def _indexed(affine: Floats, origin_mm: Floats, voxel_mm: float) -> Floats:
@@ -434,28 +432,30 @@ def _walk_bands(  # type: ignore[no-untyped-def]
     chi2,
     residual,
 ):
-    """Walk all rays of a window, band by band."""
-    for band in prange(len(low)):
+    """Walk all rays of all steps, a band of rows at a time."""
+    bands = low.shape[1]
+    for task in prange(low.size):
+        t, band = task // bands, task % bands
         _walk_band(
             volume,
             shape,
             place,
             support,
-            box,
-            rays,
+            box[t],
+            rays[t],
             heights,
-            maps,
+            maps[t],
             patterns,
-            target,
-            weight,
+            target[t],
+            weight[t % len(weight)],
             voxel_mm,
             sensitivities,
-            low[band],
+            low[t, band],
             band,
-            matrices[band],
-            vectors[band],
-            chi2,
-            residual,
+            matrices[t, band],
+            vectors[t, band],
+            chi2[t],
+            residual[t],
         )
 
 

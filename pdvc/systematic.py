@@ -67,18 +67,18 @@ class Systematic:
     shape: tuple[int, int]
     """Rows and columns of the used window."""
 
-    def registered(self, step: int, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Image:
-        """Return e (row, column) over the window, moved with the sample.
+    def registered(self, steps: slice, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Image:
+        """Return e (step, row, column) over the window, for a range of steps, moved with the sample.
 
-        `rays` (4, 3) of the window, mm; `amplitude` (section, motion) in voxels of `voxel_mm`.
+        `rays` (step, 4, 3) of the window, mm; `amplitude` (step, section, motion) in voxels of `voxel_mm`, both
+        for the steps of the range.
         """
-        share = self.share[step]
-        field = self.fields[self.first[step]]
-        if share > 0:
-            field = (1 - share) * field + share * self.fields[self.second[step]]
-        result = np.empty(self.shape, dtype=np.float32)
+        result = np.empty((len(rays), *self.shape), dtype=np.float32)
         _register(
-            np.ascontiguousarray(field, dtype=np.float32),
+            self.fields,
+            self.first[steps],
+            self.second[steps],
+            self.share[steps],
             rays,
             basis.height_mm,
             basis.affine(amplitude) * voxel_mm,
@@ -88,42 +88,59 @@ class Systematic:
         return result
 
 
-@njit(nogil=True, cache=True, error_model="numpy", parallel=True)
-def _register(field, rays, heights, maps, corner, out):  # type: ignore[no-untyped-def]
-    """Sample `field` where each pixel's material was before it moved; zero outside."""
-    n = len(heights)
-    source, origin, down, right = rays[0], rays[1], rays[2], rays[3]
-    pitch2 = down[0] ** 2 + down[1] ** 2 + down[2] ** 2
-    normal = np.cross(down, right)
-    depth = np.sum((origin - source) * normal)
-    for row in prange(out.shape[0]):
-        for column in range(out.shape[1]):
-            ray = origin + row * down + column * right - source
+@njit(nogil=True, cache=True, error_model="numpy")
+def _bilinear(field, r, c):  # type: ignore[no-untyped-def]
+    """Interpolate between pixels; zero outside the detector."""
+    if r < -0.01 or r > field.shape[0] - 0.99 or c < -0.01 or c > field.shape[1] - 0.99:
+        return 0.0
+    i, j = min(max(int(r), 0), field.shape[0] - 2), min(max(int(c), 0), field.shape[1] - 2)
+    fr, fc = r - i, c - j
+    upper = (1 - fc) * field[i, j] + fc * field[i, j + 1]
+    lower = (1 - fc) * field[i + 1, j] + fc * field[i + 1, j + 1]
+    return (1 - fr) * upper + fr * lower
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
+    """Return coordinate i of an affine map."""
+    return m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
+
+
+@njit(nogil=True, cache=True, parallel=True, error_model="numpy")
+def _register(fields, first, second, share, rays, heights, maps, corner, out):  # type: ignore[no-untyped-def]
+    """Sample the fields where each pixel's material was before it moved."""
+    n, rows = len(heights), out.shape[1]
+    for task in prange(len(out) * rows):
+        t, row = task // rows, task % rows
+        sx, sy, sz = rays[t, 0]
+        ox, oy, oz = rays[t, 1]
+        dx, dy, dz = rays[t, 2]
+        rx, ry, rz = rays[t, 3]
+        pitch2 = dx * dx + dy * dy + dz * dz
+        nx, ny, nz = dy * rz - dz * ry, dz * rx - dx * rz, dx * ry - dy * rx
+        depth = (ox - sx) * nx + (oy - sy) * ny + (oz - sz) * nz
+        for column in range(out.shape[2]):
+            x, y, z = ox + row * dx + column * rx, oy + row * dy + column * ry, oz + row * dz + column * rz
+            x, y, z = x - sx, y - sy, z - sz
             # the point of the ray that is nearest to the axis
-            at = -(source[0] * ray[0] + source[1] * ray[1]) / (ray[0] ** 2 + ray[1] ** 2)
-            x = source + at * ray
+            at = -(sx * x + sy * y) / (x * x + y * y)
+            x, y, z = sx + at * x, sy + at * y, sz + at * z
             k = 0
-            while k + 2 < n and heights[k + 1] < x[2]:
+            while k + 2 < n and heights[k + 1] < z:
                 k += 1
-            s = 0.0
+            ux, uy, uz = _moved(maps[t, k], 0, x, y, z), _moved(maps[t, k], 1, x, y, z), _moved(maps[t, k], 2, x, y, z)
             if n > 1:
-                s = min(max((x[2] - heights[k]) / (heights[k + 1] - heights[k]), 0.0), 1.0)
-            was = np.empty(3)
-            for i in range(3):
-                one = maps[k, i, 0] * x[0] + maps[k, i, 1] * x[1] + maps[k, i, 2] * x[2] + maps[k, i, 3]
-                if n > 1:
-                    m = maps[k + 1]
-                    two = m[i, 0] * x[0] + m[i, 1] * x[1] + m[i, 2] * x[2] + m[i, 3]
-                    one = (1 - s) * one + s * two
-                was[i] = x[i] - one
-            scale = depth / np.sum((was - source) * normal)
-            hit = source + scale * (was - source) - origin
-            r = np.sum(hit * down) / pitch2 + corner[0]
-            c = np.sum(hit * right) / pitch2 + corner[1]
-            out[row, column] = 0.0
-            if -0.01 <= r <= field.shape[0] - 0.99 and -0.01 <= c <= field.shape[1] - 0.99:
-                i, j = min(max(int(r), 0), field.shape[0] - 2), min(max(int(c), 0), field.shape[1] - 2)
-                fr, fc = r - i, c - j
-                upper = (1 - fc) * field[i, j] + fc * field[i, j + 1]
-                lower = (1 - fc) * field[i + 1, j] + fc * field[i + 1, j + 1]
-                out[row, column] = (1 - fr) * upper + fr * lower
+                s = min(max((z - heights[k]) / (heights[k + 1] - heights[k]), 0.0), 1.0)
+                m = maps[t, k + 1]
+                ux += s * (_moved(m, 0, x, y, z) - ux)
+                uy += s * (_moved(m, 1, x, y, z) - uy)
+                uz += s * (_moved(m, 2, x, y, z) - uz)
+            x, y, z = x - ux - sx, y - uy - sy, z - uz - sz
+            scale = depth / (x * nx + y * ny + z * nz)
+            x, y, z = sx + scale * x - ox, sy + scale * y - oy, sz + scale * z - oz
+            r = (x * dx + y * dy + z * dz) / pitch2 + corner[0]
+            c = (x * rx + y * ry + z * rz) / pitch2 + corner[1]
+            value = _bilinear(fields[first[t]], r, c)
+            if share[t] > 0:
+                value += share[t] * (_bilinear(fields[second[t]], r, c) - value)
+            out[t, row, column] = value
