@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
@@ -123,3 +124,7 @@ def paper_options() -> MeasureOptions:
         rigid=(StageOptions(scale=2, most=8),),
         deformation=(StageOptions(scale=1, most=4),),
     )
+
+
+PROTOCOLS: dict[str, Callable[[], MeasureOptions]] = {"default": MeasureOptions, "paper": paper_options}
+"""Built-in options by name."""

@@ -43,8 +43,12 @@ ExperimentFolder = Annotated[
 ]
 MeasurementFile = Annotated[Path, typer.Argument(metavar="FILE", help="A measurement, as written by measure.")]
 Options = Annotated[
-    Path | None,
-    typer.Option("--options", metavar="TOML", help="How to measure; the defaults are what 'options' prints."),
+    str,
+    typer.Option(
+        "--options",
+        metavar="NAME|TOML",
+        help="How to measure: a built-in protocol, default or paper, or a TOML file such as 'options' prints.",
+    ),
 ]
 Threads = Annotated[
     int | None,
@@ -86,15 +90,15 @@ def scenarios(
 
 
 @app.command()
-def options() -> None:
-    """Print how measure works unless told otherwise, as TOML with every key explained.
+def options(
+    protocol: Annotated[str, typer.Argument(metavar="NAME", help="default, or paper: the paper's own.")] = "default",
+) -> None:
+    """Print a protocol of measuring as TOML, with every key explained.
 
     Example:  `pdvc-bench options > options.toml`, then change it and give it to --options.
     """
     with _answering():
-        from pdvc.measure import MeasureOptions
-
-        print(MeasureOptions().template(), end="")
+        print(_read_options(protocol).template(), end="")
 
 
 @app.command()
@@ -121,7 +125,7 @@ def simulate(
 def measure(
     experiment: ExperimentFolder,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The measurement to write (NetCDF).")],
-    options: Options = None,
+    options: Options = "default",
     work: Annotated[
         Path | None,
         typer.Option(
@@ -223,7 +227,7 @@ def report(
 def run(
     scenario: ScenarioName,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
-    options: Options = None,
+    options: Options = "default",
     threads: Threads = None,
 ) -> None:
     """Simulate, measure, score and report, in one folder; what is finished already is not done again.
@@ -262,10 +266,10 @@ def _read_truth(folder: Path) -> Truth:
     return read_truth(folder)
 
 
-def _read_options(path: Path | None) -> MeasureOptions:
-    from pdvc.measure import MeasureOptions
+def _read_options(name: str) -> MeasureOptions:
+    from pdvc.options import PROTOCOLS, MeasureOptions
 
-    return MeasureOptions() if path is None else MeasureOptions.read(path)
+    return PROTOCOLS[name]() if name in PROTOCOLS else MeasureOptions.read(Path(name))
 
 
 def _use_threads(count: int | None) -> None:
