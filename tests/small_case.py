@@ -159,10 +159,10 @@ def radiographs(basis: SectionBasis, amplitude: Floats, volume: Volume | None = 
     """Return radiographs made by pdvc's own projector from amplitudes (step, section, motion): the inverse crime."""
     volume = volume or textured()
     rays = ray_vectors(SCANNER, ANGLES).stacked()
-    grey = [project(volume, rays[t], SHAPE, basis, amplitude[t], voxel_mm=VOXEL_MM) for t in range(len(amplitude))]
+    steps = len(amplitude)
     return Images(
-        rays=rays,
-        grey=np.stack(grey),
+        rays=rays[:steps],
+        grey=project(volume, rays[:steps], SHAPE, basis, amplitude, voxel_mm=VOXEL_MM),
         weight=np.ones((1, *SHAPE), dtype=np.float32),
         volume=volume,
         systematic=None,

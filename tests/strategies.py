@@ -53,8 +53,8 @@ def descriptions(draw: st.DrawFn) -> Description:
 
     def stack() -> StackEntry:
         count = draw(st.integers(1, 4))
-        numbers = st.lists(st.floats(-1e4, 1e4), min_size=count, max_size=count)
-        return StackEntry(angle_deg=draw(numbers), time_s=draw(numbers), force_N=draw(numbers))  # type: ignore[arg-type]
+        numbers = st.lists(st.floats(-1e4, 1e4), min_size=count, max_size=count).map(tuple)
+        return StackEntry(angle_deg=draw(numbers), time_s=draw(numbers), force_N=draw(numbers))
 
     text = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=12)
     return Description(

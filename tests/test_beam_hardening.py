@@ -115,3 +115,11 @@ def test_pores_are_filled_and_specks_beside_the_sample_left_out():
 def test_only_air_is_refused():
     with pytest.raises(ValueError, match="reference radiographs: expected a sample, found only air"):
         find_outline(lambda _: np.zeros((48, 52), dtype=np.float32), SCANNER, ANGLES, None)
+
+
+def test_noisy_air_is_refused():
+    def air(view):
+        return np.random.default_rng(view).normal(0, 0.01, (48, 52)).astype(np.float32)
+
+    with pytest.raises(ValueError, match="reference radiographs: expected a sample, found only air"):
+        find_outline(air, SCANNER, ANGLES, None)

@@ -94,7 +94,13 @@ def test_a_single_image_is_a_stack_of_one(folder):
 
 
 @pytest.mark.parametrize(
-    "how", [{"imagej": True}, {"compression": "zlib", "photometric": "minisblack"}], ids=["ImageJ", "zlib"]
+    "how",
+    [
+        {"imagej": True},
+        {"compression": "zlib", "photometric": "minisblack"},
+        {"byteorder": ">", "photometric": "minisblack"},
+    ],
+    ids=["ImageJ", "zlib", "big-endian"],
 )
 def test_ordinary_tiffs_of_other_programs_are_read(folder, how):
     images = counts("test/radiographs.tif")
@@ -152,7 +158,38 @@ def test_a_truncated_stack_of_imagej_is_named(folder, share):
     path = folder / "reference/radiographs.tif"
     tifffile.imwrite(path, counts("reference/radiographs.tif"), imagej=True)
     cut(path, share)
-    assert f"{path}: expected 7 radiographs" in refused(folder)
+    assert f"{path}: truncated: expected 7 images" in refused(folder)
+
+
+def compressed(path, name):
+    """Write a stack compressed, image by image, and return the file's bytes."""
+    tifffile.imwrite(path, counts(name), compression="zlib", photometric="minisblack")
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("left", [0.95, 0.5, 0.2])
+def test_a_truncated_compressed_stack_is_named(folder, left):
+    path = folder / "test/radiographs.tif"
+    whole = compressed(path, "test/radiographs.tif")
+    path.write_bytes(whole[: int(left * len(whole))])
+    assert str(path) in refused(folder)
+
+
+def test_a_stack_cut_within_its_header_is_named(folder):
+    path = folder / "test/radiographs.tif"
+    path.write_bytes(compressed(path, "test/radiographs.tif")[:5])
+    assert str(path) in refused(folder)
+
+
+def test_a_flat_lost_by_truncation_is_missed(folder):
+    """The first flat is whole, and nothing but the file's own notes tells that there was a second."""
+    path = folder / "flats.tif"
+    whole = compressed(path, "flats.tif")
+    with tifffile.TiffFile(path) as tiff:
+        first = tiff.pages[0]
+        end = first.dataoffsets[0] + first.databytecounts[0]
+    path.write_bytes(whole[:end])
+    assert str(path) in refused(folder)
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "float32"])
@@ -230,6 +267,18 @@ def test_a_writer_that_fails_keeps_what_it_has_written(tmp_path):
         for i in range(2, 7):
             writer.write(i, images[i])
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), images)
+
+
+def test_a_stack_whose_writer_was_killed_after_the_last_image_is_finished_by_the_next(tmp_path):
+    images = np.random.default_rng(0).integers(0, 65536, (16, 3, 5), dtype=np.uint16)
+    killed = StackWriter(tmp_path / "a.tif", images.shape)
+    for i, image in enumerate(images):
+        killed.write(i, image)
+    del killed
+    with StackWriter(tmp_path / "a.tif", images.shape) as writer:
+        assert writer.done == 16
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), images)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
 
 
 def test_a_stack_of_another_shape_is_begun_anew(tmp_path):

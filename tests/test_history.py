@@ -151,6 +151,18 @@ def test_fourier_functions_repeat_after_their_period():
     np.testing.assert_allclose(functions[:, 0], [0, 0, 1, 1], atol=1e-12)
 
 
+def test_the_sine_of_half_turns_is_zero_and_is_dropped():
+    record = Series(
+        counts=np.zeros((12, 1, 1), dtype=np.uint16),
+        angle_rad=np.deg2rad(180.0 * np.arange(12)),
+        time_s=np.arange(12.0),
+        force_N=np.ones(12),
+    )
+    basis = time_basis((Polynomial(degree=0), Angle()), record)
+    assert len(basis) == 2
+    assert left_over(np.stack([np.ones(12), (-1.0) ** np.arange(12)]), basis) < 1e-9
+
+
 def test_nothing_but_zero_is_refused():
     with pytest.raises(ValueError, match="expected at least one that is not zero over the steps"):
         time_basis((Ramp(start=50),), series(30))

@@ -2,11 +2,13 @@
 
 from dataclasses import fields, replace
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
 
 from pdvc.measurement import MeasurementError, read_measurement, write_measurement
+from pdvc.sections import CONTRACTION, RIGID, SectionBasis
 from tests import synthetic_records as records
 
 RESIDUALS = ("residual_initial", "residual_rigid", "residual_final")
@@ -51,6 +53,33 @@ def test_residuals_come_back_to_half_their_quantum_and_their_gaps_as_gaps(measur
     assert np.isnan(again.residual_final[3, :2]).all()
 
 
+def test_residuals_too_large_for_the_quantum_come_back_with_a_coarser_one(measured, tmp_path):
+    residual = measured.residual_initial.copy()
+    residual[0, 0, 0] = 5
+    write_measurement(replace(measured, residual_initial=residual), tmp_path / "a.nc")
+    again = read_measurement(tmp_path / "a.nc")
+    np.testing.assert_allclose(again.residual_initial, residual, atol=0.51 * 5 / 32767)
+
+
+def test_stages_with_other_motions_than_the_sections_come_back(tmp_path):
+    """The rigid body has six motions where the sections contract, too."""
+    record = records.measurement(np.random.default_rng(0).normal(size=(records.STEPS, 9, 7)))
+    basis = SectionBasis(height_mm=record.basis.height_mm, radius_mm=0.6, motions=(*RIGID, CONTRACTION))
+    rigid = replace(record.stages[0], spatial=np.random.default_rng(1).normal(size=(5, 1, 6)))
+    stages = (rigid, *record.stages[1:])
+    write_measurement(replace(record, basis=basis, stages=stages), tmp_path / "a.nc")
+    again = read_measurement(tmp_path / "a.nc")
+    assert again.basis.motions == basis.motions
+    for one, two in zip(again.stages, stages, strict=True):
+        np.testing.assert_array_equal(one.spatial, two.spatial)
+
+
+def test_a_displacement_is_unknown_only_next_to_an_unobserved_section(measured):
+    first, second, third = measured.basis.height_mm[:3]
+    u = measured.displacement(4, np.array([[0, 0, (first + second) / 2], [0.1, 0, (second + third) / 2]]))
+    np.testing.assert_array_equal(np.isnan(u).any(axis=1), [True, False])
+
+
 def test_a_solver_without_modes_has_none_when_read_back(measured, tmp_path):
     stage = replace(measured.stages[1], solver="gauss-newton", temporal=np.empty((0, 24)), spatial=np.empty((0, 9, 6)))
     write_measurement(replace(measured, stages=(measured.stages[0], stage)), tmp_path / "a.nc")
@@ -79,6 +108,14 @@ def test_a_truncated_file_is_refused_by_name(measured, tmp_path, share):
 def test_another_netcdf_file_is_refused_by_name(tmp_path):
     xr.Dataset({"a": ("x", np.arange(3))}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
     with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 1"):
+        read_measurement(tmp_path / "a.nc")
+
+
+def test_another_format_is_refused_with_its_number(measured, tmp_path):
+    write_measurement(measured, tmp_path / "a.nc")
+    with h5py.File(tmp_path / "a.nc", "r+") as file:
+        file.attrs["format"] = 99
+    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 1: found format 99"):
         read_measurement(tmp_path / "a.nc")
 
 

@@ -10,7 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from pdvc.projection import normal_equations, project
+from pdvc import projection
+from pdvc.geometry import ConeBeam
+from pdvc.projection import StepEquations
+from pdvc.rays import ray_vectors
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
 from pdvc.volume import Grid, Volume
 from tests.small_case import (
@@ -33,6 +36,21 @@ EVEN = np.ones(SHAPE, dtype=np.float32)
 BLOB_CENTRE = np.array([0.11, -0.07, 0.05])
 BLOB_SHAPE = np.array([[40.0, 9.0, 0.0], [9.0, 70.0, -12.0], [0.0, -12.0, 30.0]])
 """Inverse covariance of the blob, 1 / mm^2."""
+
+
+def project(volume, rays, shape, basis, amplitude, *, voxel_mm):
+    """Return the radiograph (row, column) of a single step."""
+    return projection.project(volume, rays[None], shape, basis, amplitude[None], voxel_mm=voxel_mm)[0]
+
+
+def normal_equations(volume, rays, basis, amplitude, target, weight, *, voxel_mm):
+    """Return the equations of a single step."""
+    found = projection.normal_equations(
+        volume, rays[None], basis, amplitude[None], target[None], weight[None], voxel_mm=voxel_mm
+    )
+    return StepEquations(
+        matrix=found.matrix[0], vector=found.vector[0], chi2=found.chi2[0], residual=found.residual[0]
+    )
 
 
 def blob(voxel_mm):
@@ -136,6 +154,16 @@ def test_normal_equations_agree_with_stored_sensitivities(basis, angle):
     np.testing.assert_allclose(found.vector / scale, s.T @ (w * rho) / scale, atol=5e-3 * np.sqrt((w * rho**2).sum()))
 
 
+def test_rays_at_45_degrees_have_no_seam_between_sections_turned_against_each_other():
+    """There a ray follows x and y alike, and its parts in two sections must be summed over the same planes."""
+    amplitude = still(SECTIONS)
+    amplitude[:, RIGID.index("rotation_z")] = [0.3, -0.3, 0.3, -0.3]
+    rays = rays_at(np.pi / 4)
+    found = project(textured(), rays, SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM)
+    expected = plane_sums(textured(), rays, SHAPE, SECTIONS, amplitude, VOXEL_MM)
+    np.testing.assert_allclose(found.ravel(), expected, atol=1e-4 * expected.max())
+
+
 def test_amplitudes_are_counted_in_the_voxel_that_is_named_whatever_the_volume_s():
     rays, amplitude = rays_at(1.0), motion(SECTIONS)
     fine = normal_equations(textured(), rays, SECTIONS, amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM)
@@ -214,6 +242,17 @@ def test_a_pixel_of_no_weight_counts_for_nothing():
     assert (one.residual != two.residual).any()
 
 
+def test_a_nan_in_a_pixel_of_no_weight_counts_for_nothing():
+    rays, target, weight = rays_at(0.2), smooth(1), EVEN.copy()
+    weight[3, 4] = 0
+    whole = normal_equations(textured(), rays, SECTIONS, still(SECTIONS), target, weight, voxel_mm=VOXEL_MM)
+    target[3, 4] = np.nan
+    holed = normal_equations(textured(), rays, SECTIONS, still(SECTIONS), target, weight, voxel_mm=VOXEL_MM)
+    np.testing.assert_array_equal(holed.matrix, whole.matrix)
+    np.testing.assert_array_equal(holed.vector, whole.vector)
+    assert holed.chi2 == whole.chi2
+
+
 def test_a_window_without_any_weight_gives_empty_equations():
     found = normal_equations(textured(), rays_at(0.2), SECTIONS, still(SECTIONS), BLANK, BLANK, voxel_mm=VOXEL_MM)
     assert not found.matrix.any()
@@ -240,6 +279,24 @@ def test_one_and_two_threads_give_the_same_bits():
     np.testing.assert_array_equal(one.vector, two.vector)
     np.testing.assert_array_equal(one.residual, two.residual)
     assert one.chi2 == two.chi2
+
+
+@pytest.mark.parametrize("one_weight_for_all", [True, False])
+def test_steps_together_are_those_one_by_one_to_the_last_bit(one_weight_for_all):
+    """Moved far and little, so that bands of rows touch more sections in one step than in the other."""
+    rays = ray_vectors(SCANNER, np.array([0.1, 0.8, 2.9])).stacked()
+    amplitude = np.stack([motion(SECTIONS, seed=step, size=6.0 * step) for step in range(3)])
+    target = np.stack([smooth(step) for step in range(3)])
+    weight = np.abs(np.stack([smooth(9 + step) for step in range(1 if one_weight_for_all else 3)]))
+    together = projection.normal_equations(textured(), rays, SECTIONS, amplitude, target, weight, voxel_mm=VOXEL_MM)
+    alone = projection.project(textured(), rays, SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM)
+    for t in range(3):
+        w = weight[t % len(weight)]
+        one = normal_equations(textured(), rays[t], SECTIONS, amplitude[t], target[t], w, voxel_mm=VOXEL_MM)
+        for name in ("matrix", "vector", "chi2", "residual"):
+            np.testing.assert_array_equal(getattr(together, name)[t], getattr(one, name), err_msg=name)
+        one = project(textured(), rays[t], SHAPE, SECTIONS, amplitude[t], voxel_mm=VOXEL_MM)
+        np.testing.assert_array_equal(alone[t], one)
 
 
 @pytest.mark.parametrize("kind", ["translation_x", "translation_y", "translation_z"])
@@ -284,16 +341,56 @@ def test_a_long_window_is_the_sum_of_its_parts():
     np.testing.assert_allclose(sum(part.matrix for part in parts), whole.matrix, rtol=1e-5, atol=1e-5)
 
 
+def test_a_wide_window_is_the_sum_of_its_columns():
+    """The rays of a row rise differently in a wide fan: its middle reaches sections that its ends do not."""
+    scanner = ConeBeam(source_axis_mm=20.0, source_detector_mm=40.0, pixel_mm=0.8, rows=45, columns=41)
+    values = np.zeros((170, 12, 14), dtype=np.float32)
+    values[6:-6, 2:-2, 2:-2] = 1 + 0.2 * np.random.default_rng(0).random((158, 8, 10))
+    volume = volume_of(values, 0.1)
+    basis = SectionBasis(height_mm=np.linspace(-8, 8, 80), radius_mm=0.5)
+
+    def matrix(first, last):
+        rays = rays_at(0.3, scanner.cropped(0, scanner.rows, first, last))
+        blank = np.zeros((scanner.rows, last - first), dtype=np.float32)
+        even = np.ones_like(blank)
+        return normal_equations(volume, rays, basis, still(basis), blank, even, voxel_mm=0.1).matrix
+
+    columns = sum(matrix(column, column + 1) for column in range(scanner.columns))
+    np.testing.assert_allclose(matrix(0, scanner.columns), columns, atol=1e-4 * np.diag(columns).max())
+
+
+@pytest.mark.parametrize("moved_voxel", [0.0, 1.0])
+@pytest.mark.parametrize("angle", [0.2, 1.9])
+def test_a_uniform_bar_cut_in_height_inside_its_hull_feels_no_vertical_motion(angle, moved_voxel):
+    """The step from the sample to the volume's empty outermost layer is where the scan ends, and no texture."""
+    whole = textured().values.copy()
+    whole[1:-1] = whole[len(whole) // 2]
+    endless = volume_of(whole)
+    values = whole[14:50].copy()
+    values[[0, -1]] = 0
+    x, y, z = endless.grid.origin_mm
+    grid = Grid(shape=values.shape, voxel_mm=VOXEL_MM, origin_mm=(x, y, z + 14 * VOXEL_MM))
+    cut = Volume(values=values, grid=grid, hull=endless.hull)
+    basis = SectionBasis(
+        height_mm=np.array([0.0]), radius_mm=0.5, motions=("translation_x", "translation_y", "translation_z")
+    )
+    found = normal_equations(
+        cut, rays_at(angle), basis, np.array([[0.0, 0.0, moved_voxel]]), BLANK, EVEN, voxel_mm=VOXEL_MM
+    )
+    sensitivity = np.sqrt(np.diag(found.matrix))
+    assert sensitivity[2] < 1e-5 * sensitivity[:2].max()
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_amplitudes_that_are_no_numbers_are_refused(bad):
     amplitude = still(SECTIONS)
     amplitude[1, 1] = bad
-    with pytest.raises(ValueError, match=r"amplitude: expected finite \(4, 6\)"):
+    with pytest.raises(ValueError, match=r"amplitude: expected finite \(1, 4, 6\)"):
         project(textured(), rays_at(0.0), SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM)
 
 
 def test_amplitudes_of_another_basis_are_refused():
-    with pytest.raises(ValueError, match=r"amplitude: expected finite \(4, 6\), got \(1, 6\)"):
+    with pytest.raises(ValueError, match=r"amplitude: expected finite \(1, 4, 6\), got \(1, 1, 6\)"):
         project(textured(), rays_at(0.0), SHAPE, SECTIONS, still(ONE), voxel_mm=VOXEL_MM)
 
 

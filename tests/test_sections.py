@@ -73,6 +73,14 @@ def test_rigid_motions_of_many_steps_are_carried_over_step_by_step():
     np.testing.assert_array_equal(together[2], basis.rigid(amplitude[2], single))
 
 
+def test_sections_reproduce_the_contraction_of_a_single_one():
+    single = SectionBasis(height_mm=np.array([0.0]), radius_mm=0.5, motions=(CONTRACTION,))
+    basis = SectionBasis(height_mm=np.array([-1.0, 1.0]), radius_mm=0.25, motions=(*RIGID, CONTRACTION))
+    points = [[0.3, 0.2, 0.4], [-0.1, 0.6, -3.0]]
+    same = basis.rigid([[3.0]], single)
+    np.testing.assert_allclose(basis.displacement(same, points), single.displacement([[3.0]], points), atol=1e-12)
+
+
 def test_a_unit_rotation_moves_a_point_at_the_radius_by_one_voxel():
     basis = SectionBasis(height_mm=np.array([0.0]), radius_mm=0.6)
     amplitude = np.zeros((1, 6))

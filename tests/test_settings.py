@@ -60,6 +60,28 @@ def test_a_number_in_a_list_is_named_by_its_place():
     assert "test.force_N.0: expected a finite number, given nan" in text
 
 
+@pytest.mark.parametrize(
+    ("path", "value", "expected"),
+    [
+        (("geometry", "rows"), "6", "geometry.rows: expected a valid integer, given '6'"),
+        (("geometry", "rows"), 6.5, "geometry.rows: expected a valid integer"),
+        (("geometry", "rows"), True, "geometry.rows: expected a valid integer, given True"),
+        (("geometry", "pixel_mm"), "0.5", "geometry.pixel_mm: expected a valid number, given '0.5'"),
+        (("geometry", "pixel_mm"), True, "geometry.pixel_mm: expected a valid number, given True"),
+        (("test", "force_N"), ["7.0"], "test.force_N.0: expected a valid number, given '7.0'"),
+        (("test", "force_N"), 7.0, "test.force_N: expected a valid array, given 7.0"),
+    ],
+)
+def test_nothing_is_turned_into_the_type_it_should_be_of(path, value, expected):
+    assert expected in explained(changed(path, value))
+
+
+def test_whole_numbers_pass_for_lengths_and_lists_for_tuples():
+    found = Description.parse(changed(("geometry", "source_axis_mm"), 30), where="a.toml")
+    assert found.geometry.source_axis_mm == 30.0
+    assert found.reference.angle_deg == (0.0, 90.0)
+
+
 def test_every_wrong_key_is_named_at_once():
     text = explained(changed(("geometry", "rows"), 0) | {"comment": "hello"})
     assert "geometry.rows: expected greater than or equal to 1, given 0" in text

@@ -164,6 +164,24 @@ def test_a_strong_prior_leaves_no_motion(solver):
     assert np.abs(found.coefficients).max() < 1e-6
 
 
+def test_a_strong_prior_pulls_back_to_no_motion_from_a_start():
+    """The data know nothing better than the start: what is minimised falls although the residual rises."""
+    equations, functions = random_equations(9), random_functions(9)
+    start = np.full((3, 2, 3), 2.0)
+    begun = functions.T @ start.reshape(3, 6)
+    vector = np.einsum("tij,tj->ti", equations.matrix, begun)
+    equations = replace(equations, vector=vector, chi2=equations.chi2 + (vector * begun).sum(axis=1))
+    found = gauss_newton.solve(
+        linear_model(equations, functions, (2, 3)),
+        functions,
+        start,
+        prior(1e-4, (2, 3)),
+        most_passes=9,
+        least_change_voxel=1e-9,
+    )
+    assert np.abs(found.coefficients).max() < 1e-3
+
+
 def test_without_data_the_posterior_is_the_prior():
     blank = replace(random_equations(1), matrix=np.zeros((9, 6, 6)), vector=np.zeros((9, 6)))
     functions = random_functions(1)
@@ -172,6 +190,19 @@ def test_without_data_the_posterior_is_the_prior():
     np.testing.assert_allclose(known.deviation, np.broadcast_to(expected[:, None, None], (9, 2, 3)), rtol=1e-9)
     np.testing.assert_allclose(known.data_share, 0, atol=1e-9)
     assert not known.observed.any()
+
+
+def test_without_any_residual_the_posterior_knows_what_the_data_see_and_no_more():
+    equations, functions = random_equations(1), random_functions(1)
+    matrix = equations.matrix.copy()
+    matrix[:, 3:] = 0
+    matrix[:, :, 3:] = 0
+    perfect = replace(equations, matrix=matrix, vector=0 * equations.vector, chi2=0 * equations.chi2)
+    known = posterior(perfect, functions, prior(30, (2, 3)))
+    before = 30 * np.sqrt((functions**2).sum(axis=0))
+    assert (known.deviation[:, 0] < 1e-6 * before[:, None]).all()
+    np.testing.assert_allclose(known.deviation[:, 1], np.broadcast_to(before[:, None], (9, 3)), rtol=1e-9)
+    np.testing.assert_array_equal(known.observed, [True, False])
 
 
 def test_the_data_s_share_is_what_they_took_of_the_prior_s_variance():
@@ -281,10 +312,11 @@ def test_gauss_newton_gives_the_motion_back():
     assert rms_displacement(recovered().coefficients - true_motion()) < 1e-3
 
 
-def test_gauss_newton_lowers_the_residual_in_every_pass_and_says_that_it_converged():
+def test_gauss_newton_lowers_the_residual_in_each_of_ten_passes_at_most_and_says_that_it_converged():
     assert (np.diff(recovered().rms) < 0).all()
     assert recovered().rms[-1] < 1e-4 * recovered().rms[0]
     assert "converged" in recovered().stop_reason
+    assert len(recovered().rms) <= 11
 
 
 def pgd_of_rank_one(**options):
@@ -357,7 +389,17 @@ def test_steps_in_another_order_give_the_same_motion():
     one = gauss_newton.solve(lineariser(images, SECTIONS), time_functions(), ZERO, prior(), **options)
     two = gauss_newton.solve(lineariser(shuffled, SECTIONS), time_functions()[:, order], ZERO, prior(), **options)
     np.testing.assert_allclose(two.coefficients, one.coefficients, atol=1e-8)
-    np.testing.assert_array_equal(two.equations.residual, one.equations.residual[order])
+    np.testing.assert_allclose(two.rms, one.rms, rtol=1e-6)
+
+
+def test_steps_in_another_order_have_the_same_equations_to_the_last_bit():
+    order = np.random.default_rng(14).permutation(STEPS)
+    images = images_of("full")
+    shuffled = replace(images, rays=images.rays[order], grey=images.grey[order])
+    amplitude = moved(0.7 * true_motion())
+    one, two = linearise(images, SECTIONS, amplitude), linearise(shuffled, SECTIONS, amplitude[order])
+    for name in ("matrix", "vector", "chi2", "residual"):
+        np.testing.assert_array_equal(getattr(two, name), getattr(one, name)[order], err_msg=name)
 
 
 # Why a solver stops

@@ -18,9 +18,18 @@ def test_the_fillet_is_a_circle_that_touches_the_ligament():
     specimen = Specimen()
     z = np.linspace(-5, 5, 21)
     half_x, half_y = section_mm(specimen, z)
-    to_centre = np.hypot(half_x - (1.31 / 2 + 20.5), z)
-    np.testing.assert_allclose(to_centre, 20.5, rtol=1e-14)
-    np.testing.assert_array_equal(half_y, 0.455)
+    np.testing.assert_allclose(np.hypot(half_x - (1.31 / 2 + 20.5), z), 20.5, rtol=1e-14)
+    np.testing.assert_allclose(np.hypot(half_y - (0.91 / 2 + 20.5), z), 20.5, rtol=1e-14)
+
+
+def test_a_side_that_is_not_thinned_is_flat():
+    z = np.linspace(-5, 5, 21)
+    thinned, flat = section_mm(Specimen(thinned="x"), z)
+    np.testing.assert_array_equal(thinned, section_mm(Specimen(), z)[0])
+    np.testing.assert_array_equal(flat, 0.455)
+    flat, thinned = section_mm(Specimen(thinned="y"), z)
+    np.testing.assert_array_equal(thinned, section_mm(Specimen(), z)[1])
+    np.testing.assert_array_equal(flat, 0.655)
 
 
 def test_the_grip_has_a_constant_section():
@@ -59,7 +68,9 @@ def test_mesh_vertices_lie_on_the_surface_and_facets_within_the_stated_error():
     assert np.abs(depth_mm(specimen, mesh.vertices[used])).max() < 1e-12
     middles = mesh.vertices[mesh.faces[sides]].mean(axis=1)
     assert np.abs(depth_mm(specimen, middles)).max() < specimen.facet_error_mm < 1e-4
-    assert mesh.edges_unique_length.max() < 3 * specimen.facet_mm
+    # a facet grows with the section, from the ligament to the grips
+    growth = specimen.grip_width_mm / np.array([specimen.width_mm, specimen.thickness_mm])
+    assert mesh.edges_unique_length.max() < np.linalg.norm(growth) * specimen.facet_mm
 
 
 def test_depth_agrees_with_the_distance_to_the_mesh():

@@ -34,8 +34,8 @@ def systematic(share=0.0, values=None):
 
 
 def registered(of, amplitude, angle=0.7):
-    rays = ray_vectors(SCANNER.cropped(*WINDOW), angle).stacked()[0]
-    return of.registered(0, rays, BASIS, amplitude, VOXEL_MM)
+    rays = ray_vectors(SCANNER.cropped(*WINDOW), angle).stacked()
+    return of.registered(slice(0, 1), rays, BASIS, amplitude[None], VOXEL_MM)[0]
 
 
 def window(image, down=0, right=0):
@@ -90,6 +90,20 @@ def test_without_motion_the_field_is_itself(angle):
     np.testing.assert_allclose(registered(systematic(), np.zeros(BASIS.shape), angle), window(fields()[0]), atol=1e-5)
 
 
+def test_without_motion_the_field_is_itself_to_the_detector_s_edge():
+    whole = Systematic(
+        fields=fields(),
+        first=np.array([0]),
+        second=np.array([1]),
+        share=np.zeros(1),
+        corner=(0, 0),
+        shape=(SCANNER.rows, SCANNER.columns),
+    )
+    rays = ray_vectors(SCANNER, 0.7).stacked()
+    found = whole.registered(slice(0, 1), rays, BASIS, np.zeros((1, *BASIS.shape)), VOXEL_MM)[0]
+    np.testing.assert_allclose(found, fields()[0], atol=1e-4)
+
+
 def test_half_a_share_is_the_mean_of_both():
     both = registered(systematic(share=0.5), np.zeros(BASIS.shape))
     np.testing.assert_allclose(both, window(fields().mean(axis=0)), atol=1e-5)
@@ -112,6 +126,27 @@ def test_motion_across_the_beam_moves_the_field_along_its_rows(angle):
     found = registered(systematic(), amplitude, angle)
     # rays fan out: at the image's edge a shift of 2 px is a little more or less
     np.testing.assert_allclose(found, window(fields()[0], right=-2), atol=0.02)
+
+
+def test_a_range_of_steps_takes_each_step_s_own_views_and_motion():
+    values = fields(4)
+    of = Systematic(
+        fields=values,
+        first=np.array([3, 0, 1, 2]),
+        second=np.array([0, 1, 2, 3]),
+        share=np.array([0.1, 0.0, 0.3, 0.6]),
+        corner=(WINDOW[0], WINDOW[2]),
+        shape=SHAPE,
+    )
+    rays = ray_vectors(SCANNER.cropped(*WINDOW), np.array([0.2, 0.9, 1.6, 2.3])).stacked()
+    amplitude = np.random.default_rng(2).normal(size=(4, *BASIS.shape))
+    found = of.registered(slice(1, 4), rays[1:], BASIS, amplitude[1:], VOXEL_MM)
+    assert found.shape == (3, *SHAPE)
+    for t in (1, 2, 3):
+        alone = of.registered(slice(t, t + 1), rays[t : t + 1], BASIS, amplitude[t : t + 1], VOXEL_MM)[0]
+        np.testing.assert_array_equal(found[t - 1], alone)
+    still = of.registered(slice(2, 3), rays[2:3], BASIS, np.zeros((1, *BASIS.shape)), VOXEL_MM)[0]
+    np.testing.assert_allclose(still, window(0.7 * values[1] + 0.3 * values[2]), atol=1e-5)
 
 
 def test_what_comes_from_off_the_detector_is_zero():

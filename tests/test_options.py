@@ -1,0 +1,115 @@
+"""Options: what is left open follows the detector, what is impossible is refused, and the paper's are the paper's."""
+
+import pytest
+from pydantic import ValidationError
+
+from pdvc.geometry import ConeBeam
+from pdvc.history import PAPER
+from pdvc.options import MeasureOptions, StageOptions, paper_options, resolved
+from pdvc.sections import RIGID
+from pdvc.settings import SettingsError
+
+
+def scanner(rows, columns):
+    return ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.1, rows=rows, columns=columns)
+
+
+def scales(stages):
+    return [stage.scale for stage in stages]
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "discard_rows", "discard_columns", "coarse"),
+    [(954, 432, 100, 60, 8), (238, 108, 25, 15, 2)],
+    ids=["the paper's detector", "a quarter of it"],
+)
+def test_what_is_left_open_scales_with_the_detector(rows, columns, discard_rows, discard_columns, coarse):
+    options = resolved(MeasureOptions(), scanner(rows, columns))
+    assert (options.discard_rows, options.discard_columns) == (discard_rows, discard_columns)
+    assert scales(options.rigid) == [coarse, 2]
+    assert scales(options.deformation) == [2, 1]
+
+
+@pytest.mark.parametrize(
+    ("rows", "coarse"), [(1, 1), (100, 1), (199, 1), (200, 2), (399, 2), (400, 4), (1600, 16), (9999, 16)]
+)
+def test_the_coarse_scale_leaves_a_hundred_rows(rows, coarse):
+    options = MeasureOptions(rigid=(StageOptions(scale="coarse"),))
+    assert scales(resolved(options, scanner(rows, 432)).rigid) == [coarse]
+
+
+def test_what_is_given_stays():
+    options = MeasureOptions(
+        discard_rows=0, discard_columns=7, rigid=(StageOptions(scale=3),), deformation=(StageOptions(most=1),)
+    )
+    assert resolved(options, scanner(954, 432)) == options
+
+
+def test_resolving_twice_changes_nothing_more():
+    once = resolved(MeasureOptions(), scanner(500, 300))
+    assert resolved(once, scanner(500, 300)) == once
+
+
+@pytest.mark.parametrize("change", [{"discard_rows": 477}, {"discard_columns": 216}, {"discard_rows": 9999}])
+def test_a_crop_that_leaves_nothing_is_refused_with_the_detector_s_size(change):
+    with pytest.raises(
+        ValueError, match="discard_rows, discard_columns: expected to leave some of 954 x 432 px"
+    ) as at:
+        resolved(MeasureOptions(**change), scanner(954, 432))
+    assert "\n" not in str(at.value)
+    assert str(next(iter(change.values()))) in str(at.value)
+
+
+def test_a_crop_that_leaves_a_row_and_a_column_passes():
+    options = MeasureOptions(discard_rows=476, discard_columns=215)
+    assert resolved(options, scanner(954, 432)).discard_rows == 476
+
+
+@pytest.mark.parametrize("stages", [(), ({"scale": 2},), ({"scale": 1}, {"scale": 2}), ({"scale": "coarse"},)])
+def test_the_last_stage_of_deformation_is_at_scale_1(stages):
+    with pytest.raises(SettingsError, match="deformation: expected at least one stage, the last at scale 1"):
+        MeasureOptions.parse({"deformation": list(stages)}, where="options")
+
+
+def test_a_measurement_without_a_rigid_stage_is_refused():
+    with pytest.raises(SettingsError, match="rigid: expected at least one stage"):
+        MeasureOptions.parse({"rigid": []}, where="options")
+
+
+@pytest.mark.parametrize("scale", [0, 17, "fine", "2"])
+def test_a_scale_that_is_none_is_refused(scale):
+    with pytest.raises(SettingsError, match=r"rigid\.0\.scale"):
+        MeasureOptions.parse({"rigid": [{"scale": scale}]}, where="options")
+
+
+@pytest.mark.parametrize("names", [("rotation_w",), ()])
+def test_unknown_motions_are_refused(names):
+    with pytest.raises(ValidationError, match="section motions: expected some of"):
+        MeasureOptions(section_motions=names)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [MeasureOptions(), paper_options(), resolved(MeasureOptions(), scanner(954, 432))],
+    ids=["defaults", "paper", "resolved"],
+)
+def test_a_template_reads_back_as_the_same_options(tmp_path, options):
+    path = tmp_path / "options.toml"
+    path.write_text(options.template(), encoding="utf-8")
+    assert MeasureOptions.read(path) == options
+
+
+def test_the_paper_s_options_are_the_paper_s():
+    options = resolved(paper_options(), scanner(954, 432))
+    assert (options.discard_rows, options.discard_columns) == (100, 60)
+    assert options.sections == 15
+    assert options.section_motions == RIGID
+    assert options.time == PAPER
+    assert [(stage.scale, stage.solver, stage.most, stage.passes_per_mode) for stage in options.rigid] == [
+        (2, "pgd", 8, 1)
+    ]
+    assert [(stage.scale, stage.solver, stage.most, stage.passes_per_mode) for stage in options.deformation] == [
+        (1, "pgd", 4, 1)
+    ]
+    assert options.weighting == "uniform"
+    assert options.subtract_systematic
