@@ -67,7 +67,7 @@ def chords_of_ellipsoid(centre, shape, source, directions):
 
 
 def chords_of_box(half, source, directions):
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore"):
         near, far = ((side * half - source) / directions for side in (-1, 1))
     return np.maximum(np.maximum(near, far).min(-1) - np.minimum(near, far).max(-1), 0)
 
