@@ -312,12 +312,12 @@ def _read_tiff(path: Path) -> NDArray[Any]:
             if len(tiff.series) != 1:
                 raise ExperimentError(f"{path}: expected one stack of equal images, found {len(tiff.series)} series")
             series = tiff.series[0]
-            declared = _declared_images(tiff)
-            if declared is not None and declared != len(tiff.pages) and declared != len(series):
-                raise ExperimentError(f"{path}: truncated: expected {declared} images, found {len(tiff.pages)}")
             needed = series.dataoffset + series.nbytes if series.dataoffset is not None else 0
             if path.stat().st_size < needed:
                 raise ExperimentError(f"{path}: truncated: expected {needed} bytes, found {path.stat().st_size}")
+            declared = _declared_images(tiff)
+            if declared is not None and declared != len(tiff.pages) and declared != len(series):
+                raise ExperimentError(f"{path}: truncated: expected {declared} images, found {len(tiff.pages)}")
             if series.dataoffset is not None:
                 return tifffile.memmap(path, mode="r")
             return series.asarray()

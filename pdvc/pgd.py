@@ -25,7 +25,7 @@ from pdvc.solution import SHORTER, Solution, evaluated, lowers
 Floats = NDArray[np.float64]
 
 FIXED_POINT_TOLERANCE = 1e-6
-FIXED_POINT_MOST = 60
+FIXED_POINT_MOST = 500
 WORTH_A_PASS = 0.005
 """A mode is found again about itself as long as that lowers the residual by more than this share."""
 
