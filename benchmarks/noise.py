@@ -1,6 +1,6 @@
 """Show how the error of `in-space` falls with the noise, and what sets its floor.
 
-Run with `python benchmarks/noise.py`; about two minutes on two cores. Writes benchmarks/results/noise.csv.
+Run with `python benchmarks/noise.py`; about four minutes on two cores. Writes benchmarks/results/noise.csv.
 """
 
 from __future__ import annotations
@@ -16,19 +16,36 @@ from simulator.scenario import Scenario, load_scenario
 from simulator.truth import read_truth
 from validation.scores import score
 
-PHOTONS = (1e3, 4e3, 1.6e4, 1e5, 4e5, 4e6)
-VIEWS = (150, 600)
-"""The built-in scenario has 150 reference views; four times as many show their part in the floor."""
+CASES = (
+    (1e3, 150, 1),
+    (4e3, 150, 1),
+    (1.6e4, 150, 1),
+    (1e5, 150, 1),
+    (4e5, 150, 1),
+    (4e6, 150, 1),
+    (4e6, 600, 1),
+    (4e6, 300, 2),
+)
+"""Photons for each pixel and frame, reference views, and how many times finer the pixels are."""
 RESULTS = Path(__file__).parent / "results" / "noise.csv"
 
 
-def variant(photons: float, views: int) -> Scenario:
-    """Return in-space with another number of photons for each pixel and frame, and of reference views."""
+def variant(photons: float, views: int, finer: int) -> Scenario:
+    """Return in-space with other numbers of photons (pixel and frame), reference views, and pixels per length."""
     base = load_scenario("in-space")
+    geometry = base.geometry
     return base.model_copy(
         update={
             "detector": base.detector.model_copy(update={"photons_per_pixel": photons}),
             "acquisition": base.acquisition.model_copy(update={"reference_views": views}),
+            "geometry": geometry.model_copy(
+                update={
+                    "pixel_mm": geometry.pixel_mm / finer,
+                    "rows": geometry.rows * finer,
+                    "columns": geometry.columns * finer,
+                }
+            ),
+            "discarded_rows": base.discarded_rows * finer,
         }
     )
 
@@ -36,26 +53,27 @@ def variant(photons: float, views: int) -> Scenario:
 def main() -> None:
     """Simulate, measure and score each variant; print and keep a table."""
     rows = []
-    for views in VIEWS:
-        for photons in PHOTONS if views == VIEWS[0] else PHOTONS[-2:]:
-            with tempfile.TemporaryDirectory() as folder:
-                simulate(variant(photons, views), Path(folder))
-                measurement = measure(read_experiment(Path(folder)), MeasureOptions())
-                scores = score(measurement, read_truth(Path(folder)))
-            row = {
-                "photons": f"{photons:.0f}",
-                "views": views,
-                "noise_limit_db": f"{scores.snr_db.noise_limit:.1f}",
-                "final_db": f"{scores.snr_db.final:.1f}",
-                "across_beam": f"{scores.error_voxel.across_beam:.4f}",
-                "across_random": f"{scores.random_voxel.across_beam:.4f}",
-                "vertical": f"{scores.error_voxel.vertical:.4f}",
-                "vertical_random": f"{scores.random_voxel.vertical:.4f}",
-                "along_beam": f"{scores.error_voxel.along_beam:.3f}",
-                "strain_rms": f"{scores.strain_rms:.1e}",
-            }
-            rows.append(row)
-            print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+    for photons, views, finer in CASES:
+        with tempfile.TemporaryDirectory() as folder:
+            simulate(variant(photons, views, finer), Path(folder))
+            measurement = measure(read_experiment(Path(folder)), MeasureOptions())
+            scores = score(measurement, read_truth(Path(folder)))
+        micrometres = measurement.voxel_mm * 1e3
+        row = {
+            "photons": f"{photons:.0f}",
+            "views": views,
+            "voxel_um": f"{micrometres:.1f}",
+            "noise_limit_db": f"{scores.snr_db.noise_limit:.1f}",
+            "final_db": f"{scores.snr_db.final:.1f}",
+            "across_voxel": f"{scores.error_voxel.across_beam:.4f}",
+            "vertical_voxel": f"{scores.error_voxel.vertical:.4f}",
+            "along_voxel": f"{scores.error_voxel.along_beam:.3f}",
+            "across_um": f"{scores.error_voxel.across_beam * micrometres:.3f}",
+            "vertical_um": f"{scores.error_voxel.vertical * micrometres:.3f}",
+            "strain_rms": f"{scores.strain_rms:.1e}",
+        }
+        rows.append(row)
+        print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
     RESULTS.parent.mkdir(exist_ok=True)
     with RESULTS.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))

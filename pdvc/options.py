@@ -1,4 +1,4 @@
-"""Options of a measurement: every choice of the protocol, with the paper's as defaults."""
+"""Options of a measurement: every choice of the protocol, in two built-in sets, `default` and `paper`."""
 
 from __future__ import annotations
 

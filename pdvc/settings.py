@@ -80,7 +80,9 @@ def _fill(table: Any, record: Settings) -> None:
         value = getattr(record, name)
         if isinstance(value, Settings) or (isinstance(value, tuple) and value and isinstance(value[0], Settings)):
             nested.append((name, value, field.description))
-        elif value is not None:
+        elif value is None:
+            table.add(tomlkit.comment(f"{name} =  # {' '.join((field.description or '').split())}"))
+        else:
             item = tomlkit.item(list(value) if isinstance(value, tuple) else value)
             if field.description:
                 item.comment(" ".join(field.description.split()))

@@ -1,0 +1,291 @@
+"""What every solver starts from: calibration, outline, and for each scale the volume and the radiographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.beam_hardening import Outline, find_outline
+from pdvc.equations import Images
+from pdvc.experiment import Experiment, Series
+from pdvc.geometry import ConeBeam
+from pdvc.options import MeasureOptions
+from pdvc.progress import Progress
+from pdvc.projection import project
+from pdvc.radiographs import Calibration, binned, calibrate, coarsened, fill, grey_levels, grey_variance, snr_db
+from pdvc.rays import ray_vectors
+from pdvc.reconstruction import fdk, seen_half_height_mm
+from pdvc.sections import SectionBasis
+from pdvc.store import Store
+from pdvc.systematic import Neighbours, Systematic, neighbouring_views
+from pdvc.volume import Grid, Hull, Volume
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+_OUTLINE_ROWS = 240
+"""The outline is found on radiographs binned to about this many rows."""
+_OUTLINE_VIEWS = 150
+_HULL_MARGIN_VOXEL = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """Hold one scale's images with what was learnt on the way."""
+
+    images: Images
+    snr_reprojection_db: Floats
+    snr_noise_db: Floats
+    noise_rms: float | None
+
+
+def used_window(geometry: ConeBeam, options: MeasureOptions) -> tuple[int, int, int, int]:
+    """Return the used rows and columns: row_from, row_to, column_from, column_to."""
+    rows, columns = options.discard_rows or 0, options.discard_columns or 0
+    return rows, geometry.rows - rows, columns, geometry.columns - columns
+
+
+def calibrated(
+    experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress
+) -> tuple[Calibration, Outline]:
+    """Return the detector's calibration, with the beam-hardening polynomial, and the sample's outline."""
+    calibration = calibrate(experiment)
+    geometry, reference = experiment.geometry, experiment.reference
+    factor = max(1, round(geometry.rows / _OUTLINE_ROWS))
+    chosen = np.unique(np.linspace(0, len(reference), min(_OUTLINE_VIEWS, len(reference)), endpoint=False).astype(int))
+    given = {"fit": None, "none": (1.0, 0.0, 0.0)}.get(str(options.beam_hardening), options.beam_hardening)
+
+    def view(i: int) -> Image:
+        return binned(grey_levels(reference.counts[chosen[i]], calibration), factor)
+
+    def found() -> dict[str, Floats]:
+        outline = find_outline(
+            view,
+            geometry.binned(factor),
+            reference.angle_rad[chosen],
+            given if isinstance(given, tuple) else None,
+            progress=progress,
+        )
+        hull = outline.hull
+        return {
+            "place_mm": np.array([hull.z_mm, hull.slab_mm]),
+            "support_mm": hull.support_mm,
+            "polynomial": np.array(outline.polynomial),
+        }
+
+    kept = store.arrays(f"outline {options.beam_hardening}", found)
+    z_mm, slab_mm = kept["place_mm"]
+    c1, c2, c3 = (float(c) for c in kept["polynomial"])
+    outline = Outline(
+        hull=Hull(z_mm=float(z_mm), slab_mm=float(slab_mm), support_mm=kept["support_mm"]), polynomial=(c1, c2, c3)
+    )
+    return calibration.with_polynomial(outline.polynomial), outline
+
+
+def prepare(
+    experiment: Experiment,
+    calibration: Calibration,
+    outline: Outline,
+    window: tuple[int, int, int, int],
+    scale: int,
+    options: MeasureOptions,
+    store: Store,
+    progress: Progress,
+) -> Prepared:
+    """Prepare one scale: volume, radiographs of the window, weights, systematic residual."""
+    geometry = experiment.geometry.binned(scale)
+    part = tuple(edge // scale for edge in window)
+    used = geometry.cropped(*part)
+    view = _viewer(experiment.reference, calibration, scale)
+    volume = _volume(experiment, geometry, outline, view, f"scale {scale} {options.beam_hardening}", store, progress)
+    systematic, snr_reprojection = _systematic(experiment, geometry, part, view, volume, options, progress)
+    grey, variance = _test_radiographs(experiment, calibration, part, scale, progress)
+    good = ~_coarse_bad(calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
+    weight = good[None].astype(np.float32)
+    if options.weighting == "noise":
+        if variance is None:
+            raise ValueError(
+                "weighting = 'noise': expected photons_per_count and readout_noise_counts in "
+                "[acquisition] of experiment.toml, found none"
+            )
+        inverse = good / variance
+        weight = np.asarray(inverse / inverse[:, good].mean(), dtype=np.float32)
+    if not good.any():
+        raise ValueError("mask: expected some used pixels, but all of the window are bad")
+    return Prepared(
+        images=Images(
+            rays=ray_vectors(used, experiment.test.angle_rad).stacked(),
+            grey=grey,
+            weight=weight,
+            volume=volume,
+            systematic=systematic if options.subtract_systematic else None,
+            voxel_mm=experiment.geometry.voxel_mm,
+        ),
+        snr_reprojection_db=snr_reprojection,
+        snr_noise_db=_noise_snr(grey, variance, good),
+        noise_rms=None if variance is None else float(np.sqrt(variance[:, good].mean(dtype=float))),
+    )
+
+
+def _viewer(series: Series, calibration: Calibration, scale: int) -> Callable[[int], Image]:
+    def view(i: int) -> Image:
+        return coarsened(grey_levels(series.counts[i], calibration), scale)
+
+    return view
+
+
+def _volume(
+    experiment: Experiment,
+    geometry: ConeBeam,
+    outline: Outline,
+    view: Callable[[int], Image],
+    name: str,
+    store: Store,
+    progress: Progress,
+) -> Volume:
+    low, high = outline.hull.box_mm()
+    radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
+    reach = seen_half_height_mm(geometry, radius)
+    hull = outline.hull
+    # two voxels of air around the hull keep interpolation, and its gradient, inside the grid
+    margin = np.full(3, 2 * geometry.voxel_mm)
+    low, high = low - margin, high + margin
+    low[2], high[2] = max(low[2], -reach), min(high[2], reach)
+    grid = Grid.around(low, high, geometry.voxel_mm)
+
+    def reconstructed() -> dict[str, NDArray[np.float32]]:
+        task = f"reconstruct {geometry.voxel_mm * 1e3:.1f} um"
+        return {"F": fdk(view, geometry, experiment.reference.angle_rad, grid, hull, progress=progress, task=task)}
+
+    values = store.arrays(f"volume {name}", reconstructed)["F"]
+    return Volume(values=values, grid=grid, hull=hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm))
+
+
+def _systematic(
+    experiment: Experiment,
+    geometry: ConeBeam,
+    part: tuple[int, ...],
+    view: Callable[[int], Image],
+    volume: Volume,
+    options: MeasureOptions,
+    progress: Progress,
+) -> tuple[Systematic, Floats]:
+    """Re-project the volume at the reference views next to the steps' angles."""
+    reference = experiment.reference.angle_rad
+    near: Neighbours = neighbouring_views(reference, experiment.test.angle_rad)
+    needed = np.unique(np.concatenate([near.first, near.second]))
+    rays = ray_vectors(geometry, reference[needed]).stacked()
+    still = SectionBasis(height_mm=np.zeros(1), radius_mm=1.0)
+    fields = np.zeros((len(needed), geometry.rows, geometry.columns), dtype=np.float32)
+    snr = np.empty(len(needed))
+    reached = _reached_rows(geometry, volume)
+    window = (slice(part[0], part[1]), slice(part[2], part[3]))
+    for n, i in enumerate(needed):
+        grey = view(int(i))
+        model = project(
+            volume,
+            rays[n : n + 1],
+            (geometry.rows, geometry.columns),
+            still,
+            np.zeros((1, *still.shape)),
+            voxel_mm=geometry.voxel_mm,
+        )[0]
+        fields[n, reached] = (model - grey)[reached]
+        snr[n] = snr_db(grey[window], fields[n][window], np.ones_like(grey[window], dtype=bool))
+        progress("re-projection", n + 1, len(needed))
+    systematic = Systematic(
+        fields=fields,
+        first=np.searchsorted(needed, near.first),
+        second=np.searchsorted(needed, near.second),
+        share=near.share,
+        corner=(part[0], part[2]),
+        shape=(part[1] - part[0], part[3] - part[2]),
+    )
+    return systematic, snr
+
+
+def _reached_rows(geometry: ConeBeam, volume: Volume) -> slice:
+    """Return the rows whose rays stay within the volume's height where they cross the sample."""
+    low, high = volume.hull.box_mm()
+    radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
+    z = np.array(
+        [volume.grid.origin_mm[2], volume.grid.origin_mm[2] + volume.grid.voxel_mm * (volume.grid.shape[0] - 1)]
+    )
+    down = -z * geometry.source_detector_mm / (geometry.source_axis_mm + radius) - geometry.row_shift_mm
+    rows = down / geometry.pixel_mm + (geometry.rows - 1) / 2
+    return slice(max(int(np.ceil(rows[1])) + 1, 0), min(int(np.floor(rows[0])), geometry.rows))
+
+
+def _test_radiographs(
+    experiment: Experiment, calibration: Calibration, part: tuple[int, ...], scale: int, progress: Progress
+) -> tuple[Image, Image | None]:
+    """Return grey levels and, where the noise is known, their variances, over the window (step, row, column)."""
+    test = experiment.test
+    window = (slice(part[0], part[1]), slice(part[2], part[3]))
+    shape = (len(test), part[1] - part[0], part[3] - part[2])
+    grey = np.empty(shape, dtype=np.float32)
+    known = experiment.photons_per_count is not None and experiment.readout_noise_counts is not None
+    variance = np.empty(shape, dtype=np.float32) if known else None
+    # what Gaussian filter and binning leave of white noise (white input, unit variance), by its impulse response
+    left = _noise_left(scale)
+    for t in range(len(test)):
+        grey[t] = coarsened(grey_levels(test.counts[t], calibration), scale)[window]
+        if variance is not None:
+            assert experiment.photons_per_count is not None
+            assert experiment.readout_noise_counts is not None
+            fine = grey_variance(
+                test.counts[t],
+                calibration,
+                photons_per_count=experiment.photons_per_count,
+                readout_noise_counts=experiment.readout_noise_counts,
+                frames=experiment.frames,
+                flats=len(experiment.flats),
+            )
+            fine = fill(fine, calibration.bad)
+            variance[t] = left * binned(fine, scale)[window]
+        progress(f"radiographs, scale {scale}", t + 1, len(test))
+    return grey, variance
+
+
+def _noise_left(scale: int) -> float:
+    impulse = np.zeros((16 * scale, 16 * scale), dtype=np.float32)
+    impulse[8 * scale, 8 * scale] = 1
+    # every fine pixel of a block answers alike on average: sum over coarse pixels of the squared response
+    return float(
+        np.mean(
+            [
+                (coarsened(np.roll(impulse, (i, j), (0, 1)), scale) ** 2).sum()
+                for i in range(scale)
+                for j in range(scale)
+            ]
+        )
+        * scale**2
+    )
+
+
+def _coarse_bad(bad: NDArray[np.bool_], scale: int) -> NDArray[np.bool_]:
+    return np.asarray(binned(bad.astype(np.float32), scale) > 0.3)
+
+
+def _noise_snr(grey: Image, variance: Image | None, good: NDArray[np.bool_]) -> Floats:
+    if variance is None:
+        return np.full(len(grey), np.nan)
+    return np.array(
+        [
+            20 * np.log10(np.std(g[good], dtype=float) / np.sqrt(v[good].mean(dtype=float)))
+            for g, v in zip(grey, variance, strict=True)
+        ]
+    )
+
+
+def snr_of(images: Images) -> Callable[[Image], Floats]:
+    """Return the function that gives the SNR (step,), dB, of residual fields (step, row, column) of these images."""
+    used = images.weight > 0
+
+    def snr(residual: Image) -> Floats:
+        return np.array([snr_db(images.grey[t], residual[t], used[t % len(used)]) for t in range(len(residual))])
+
+    return snr
