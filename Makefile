@@ -32,3 +32,16 @@ $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "expected Python 3.11 or later, found: $$($(PYTHON) --version 2>&1)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
+
+# time every stage, beside RTK and beside a plain implementation: one table. Makes an environment of its own, with the
+# extra `bench` (itk-rtk, 1.75 GB installed); RTK itself takes half a minute to load, and the whole some ten minutes
+.PHONY: bench
+bench: .venv-bench/.installed
+	.venv-bench/bin/python -m benchmarks.table
+
+.venv-bench/.installed: pyproject.toml
+	@echo "installing the extra 'bench' (itk-rtk, 1.75 GB) into .venv-bench; without it: $(BIN)/python -m benchmarks.table"
+	$(PYTHON) -m venv .venv-bench
+	echo '*' > .venv-bench/.gitignore
+	.venv-bench/bin/pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	touch $@

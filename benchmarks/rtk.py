@@ -66,7 +66,7 @@ class Joseph:
 
 
 def fdk(views: Image, geometry: ConeBeam, angle_rad: Floats, grid: Grid) -> tuple[Any, Any]:
-    """Return a function that runs RTK's FDK on views (view, row, column), and one that returns the volume (z, y, x)."""
+    """Return what runs RTK's FDK on views (view, row, column), and what returns the volume (z, y, x)."""
     import itk
     from itk import RTK as rtk
 

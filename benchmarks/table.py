@@ -1,0 +1,197 @@
+"""Time every stage at full size, beside RTK and beside a plain implementation: the table of `make bench`."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import rtk, stored
+from benchmarks.case import Case, amplitude, case
+from benchmarks.timing import in_turns, machine, once, with_threads
+from pdvc.experiment import read_experiment
+from pdvc.measure import MeasureOptions, measure
+from pdvc.projection import normal_equations, project
+from pdvc.reconstruction import fdk
+from simulator.radiography import path_lengths
+from simulator.scanner import simulate
+from simulator.scenario import course_of, load_scenario
+from simulator.views import prepare, step_image, view_image
+
+Image = NDArray[np.float32]
+ANGLE_RAD = float(np.deg2rad(33.0))
+"""Stage angle of the radiograph that is timed: neither along x nor along y, nor halfway between."""
+
+
+class Rows:
+    """Print a table row by row, as they come, then all together."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._table = Table("stage", "size", "threads", "time", "compared with", "its time", "ratio", "agreement")
+
+    def add(
+        self, stage: str, size: str, threads: int, seconds: float, other: str = "", its: float = np.nan, note: str = ""
+    ) -> None:
+        """Add a row; the ratio is this software's time over the other's."""
+        ratio = "" if np.isnan(its) else f"{seconds / its:.2f}"
+        self._table.add_row(stage, size, str(threads), _time(seconds), other, _time(its), ratio, note)
+        self._console.print(
+            f"  {stage}, {size}, {threads} threads: {_time(seconds)} {other} {_time(its)}", style="dim"
+        )
+
+    def show(self) -> None:
+        """Print the table."""
+        self._console.print(self._table)
+
+
+def _time(seconds: float) -> str:
+    if np.isnan(seconds):
+        return ""
+    return (
+        f"{seconds:.1f} s" if seconds >= 10 else f"{seconds * 1e3:.0f} ms" if seconds >= 1e-2 else f"{seconds:.1e} s"
+    )
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--full", action="store_true", help="reconstruct from all 600 views (RTK: five minutes)")
+    parser.add_argument("--repeats", type=int, default=7, help="times each short job is run (default: 7)")
+    parser.add_argument("--views", type=int, default=60, help="views of the FDK comparison (default: 60)")
+    options = parser.parse_args()
+    console = Console(width=170)
+    console.print(machine())
+    if not rtk.available():
+        console.print(rtk.MISSING)
+    rows = Rows(console)
+    full = case("jailin2018")
+    _radiograph(rows, full, options.repeats)
+    _reconstruction(rows, full, 600 if options.full else options.views)
+    _stored(rows)
+    _simulation(rows)
+    _measurement(rows)
+    rows.show()
+    console.print(machine())
+
+
+def _radiograph(rows: Rows, full: Case, repeats: int) -> None:
+    """Time one radiograph's equations and projection, each beside RTK's Joseph of the same volume and window."""
+    volume, voxel = full.volume, full.volume.grid.voxel_mm
+    still = full.basis(1)
+    for name, window in (("whole detector", full.geometry), ("used window", full.window)):
+        shape = (window.rows, window.columns)
+        rays = full.rays(window, ANGLE_RAD)
+        blank, weight = np.zeros(shape, np.float32), np.ones(shape, np.float32)
+
+        def equations(motions: int, rays=rays, blank=blank, weight=weight) -> Callable[[], Any]:  # type: ignore[no-untyped-def]
+            basis = full.basis(15, motions)
+            trial = amplitude(basis, 3.0)
+            return lambda: normal_equations(volume, rays, basis, trial, blank, weight, voxel_mm=voxel)
+
+        def plain(rays=rays, shape=shape) -> Image:  # type: ignore[no-untyped-def]
+            return project(volume, rays, shape, still, np.zeros(still.shape), voxel_mm=voxel)
+
+        for threads in (2, 1):
+            jobs = [with_threads(threads, job) for job in (equations(6), equations(7), plain)]
+            note = ""
+            if rtk.available():
+                rtk.set_threads(threads)
+                joseph = rtk.Joseph(volume.values, volume.grid, window, np.array([ANGLE_RAD]))
+                jobs.append(joseph.run)
+            times = in_turns(jobs, repeats)
+            other, its = ("RTK Joseph", times[3]) if rtk.available() else ("", np.nan)
+            if rtk.available():
+                ours, theirs = plain(), joseph.result()[0]
+                note = f"rms {np.sqrt(np.mean((ours - theirs) ** 2)) / theirs.max():.1e} of the largest"
+            size = f"{shape[0]} x {shape[1]} px, {name}"
+            rows.add("equations, 15 sections x 6 motions", size, threads, times[0], other, its)
+            rows.add("equations, 15 sections x 7 motions", size, threads, times[1], other, its)
+            rows.add("projection alone", size, threads, times[2], other, its, note)
+
+
+def _reconstruction(rows: Rows, full: Case, count: int) -> None:
+    """Time FDK of exact path lengths through the sample, nodules and all, beside RTK's, over the same box."""
+    geometry, grid = full.geometry, full.volume.grid
+    body = prepare(full.scenario, course_of(full.scenario)).body
+    angle = 2 * np.pi * np.arange(count) / count
+    views = np.stack([path_lengths(body, geometry, float(a), 1)[0] for a in angle]).astype(np.float32)
+    # compiled first, on a few views
+    few = angle[:: max(1, count // 20)]
+    fdk(lambda i: views[i], geometry, few, grid, full.sample)
+    seconds, ours = once(lambda: fdk(lambda i: views[i], geometry, angle, grid, full.sample))
+    other, its, note = "", np.nan, ""
+    if rtk.available():
+        rtk.set_threads(2)
+        run, result = rtk.fdk(views, geometry, angle, grid)
+        its, _ = once(run)
+        again, _ = once(lambda: fdk(lambda i: views[i], geometry, angle, grid, full.sample))
+        seconds = (seconds + again) / 2
+        theirs = result()
+        inside = ours != 0
+        level = float(theirs[theirs > 0.5 * np.percentile(theirs, 99)].mean(dtype=float))
+        apart = np.sqrt(np.mean((ours[inside] - theirs[inside]) ** 2, dtype=float)) / level
+        other, note = "RTK FDK, whole box", f"rms {apart:.1e} of the sample's mean, in the hull"
+    size = f"{count} views, {' x '.join(str(n) for n in grid.shape)} voxels"
+    rows.add("FDK", size, 2, seconds, other, its, note)
+
+
+def _stored(rows: Rows) -> None:
+    """Time the same equations from a stored S, at a quarter of the size."""
+    small = case("quick")
+    window, volume, voxel = small.window, small.volume, small.volume.grid.voxel_mm
+    basis = small.basis(15, 6)
+    trial = amplitude(basis, 0.7)
+    rays = small.rays(window, ANGLE_RAD)
+    weight = np.ones((window.rows, window.columns), np.float32)
+    start = project(volume, rays, weight.shape, basis, np.zeros(basis.shape), voxel_mm=voxel)
+    mine, plain = (
+        lambda: normal_equations(volume, rays, basis, trial, start, weight, voxel_mm=voxel),
+        lambda: stored.normal_equations(volume, rays, basis, trial, start, voxel),
+    )
+    times = in_turns([mine, plain], 3)
+    ours, (matrix, vector, size) = mine(), plain()
+    apart = [
+        float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in ((ours.matrix, matrix), (ours.vector, vector))
+    ]
+    rows.add(
+        "equations, 15 sections x 6 motions",
+        f"{window.rows} x {window.columns} px, one step of quick",
+        2,
+        times[0],
+        f"S stored, {size / 1e6:.0f} MB a step",
+        times[1],
+        f"B {apart[0]:.1e}, c {apart[1]:.1e}",
+    )
+
+
+def _simulation(rows: Rows) -> None:
+    scenario = load_scenario("jailin2018")
+    scanner = prepare(scenario, course_of(scenario))
+    plan = scenario.geometry
+    size = f"{plan.rows} x {plan.columns} px, {scenario.acquisition.subpixels} x {scenario.acquisition.subpixels} rays"
+    times = in_turns([lambda: view_image(scanner, 7), lambda: step_image(scanner, 90)], 3)
+    rows.add("simulate a reference view", size, 1, times[0])
+    rows.add("simulate a test radiograph", size, 1, times[1])
+
+
+def _measurement(rows: Rows) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        scenario = load_scenario("quick")
+        plan = scenario.acquisition
+        seconds, _ = once(lambda: simulate(scenario, Path(folder)))
+        rows.add("simulate quick", f"{plan.reference_views} + {plan.test_steps} radiographs", 2, seconds)
+        result = measure(read_experiment(Path(folder)), MeasureOptions())
+    for name, seconds in result.seconds.items():
+        rows.add(f"measure quick: {name}", f"{plan.test_steps} steps, 15 sections x 7 motions", 2, seconds)
+
+
+if __name__ == "__main__":
+    main()
