@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pdvc.beam_hardening import SLAB_VOXELS
 from pdvc.geometry import ConeBeam
+from pdvc.projection import project
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import seen_half_height_mm
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
@@ -52,9 +53,21 @@ class Case:
             motions=(*RIGID, CONTRACTION)[:motions],
         )
 
-    def rays(self, window: ConeBeam, angle_rad: float) -> Floats:
-        """Return the rays (4, 3) of a window at a stage angle, mm."""
-        return ray_vectors(window, angle_rad).stacked()[0]
+    def rays(self, window: ConeBeam, angle_rad: float | Floats) -> Floats:
+        """Return the rays (step, 4, 3) of a window at stage angles, mm."""
+        return ray_vectors(window, angle_rad).stacked()
+
+    def project(self, window: ConeBeam, angle_rad: float) -> Image:
+        """Return one radiograph (row, column) of the sample at rest, by pdvc's projector."""
+        still = self.basis(1)
+        return project(
+            self.volume,
+            self.rays(window, angle_rad),
+            (window.rows, window.columns),
+            still,
+            np.zeros((1, *still.shape)),
+            voxel_mm=self.volume.grid.voxel_mm,
+        )[0]
 
 
 def case(name: str = "jailin2018", rows: int | None = None) -> Case:

@@ -37,25 +37,24 @@ def main() -> None:
     print(machine())
 
 
-def one_pass(
-    on: Case, *, steps: int = 1, sections: int = 15, motions: int = 6, sensitive: bool = True
-) -> Callable[[], None]:
+def one_pass(on: Case, *, steps: int = 1, sections: int = 15, motions: int = 6) -> Callable[[], None]:
     """Return a pass over some steps of a case's used window."""
     basis = on.basis(sections, motions)
-    trial = amplitude(basis, 3.0 * on.geometry.rows / 954)
-    shape = (on.window.rows, on.window.columns)
-    rays = [on.rays(on.window, angle) for angle in 0.4 + 2 * np.pi * np.arange(steps) / 50]
-    blank, weight = np.zeros(shape, np.float32), np.ones(shape, np.float32)
+    trial = np.stack([amplitude(basis, 3.0 * on.geometry.rows / 954)] * steps)
+    rays = on.rays(on.window, 0.4 + 2 * np.pi * np.arange(steps) / 50)
+    blank = np.zeros((steps, on.window.rows, on.window.columns), np.float32)
+    weight = np.ones_like(blank[:1])
 
     def run() -> None:
-        for ray in rays:
-            normal_equations(on.volume, ray, basis, trial, blank, weight, voxel_mm=on.volume.grid.voxel_mm)
+        normal_equations(on.volume, rays, basis, trial, blank, weight, voxel_mm=on.volume.grid.voxel_mm)
 
     return run
 
 
 def _curve(jobs: Sequence[tuple[float, Callable[[], None]]], repeats: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([x for x, _ in jobs], dtype=float), np.array(in_turns([job for _, job in jobs], repeats))
+    return np.array([x for x, _ in jobs], dtype=float), np.array(
+        [taken.wall for taken in in_turns([job for _, job in jobs], repeats)]
+    )
 
 
 def _slope(x: np.ndarray, seconds: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 Each plane that a ray crosses is a sample: four values are gathered, weighted bilinearly, and summed. The planes are
 counted through the public projector: of a volume of ones at rest, a pixel's projection is its number of planes times
-voxel / largest horizontal direction cosine.
+voxel / largest horizontal direction cosine. Times are processor times of one thread.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from benchmarks.case import Case, case
 from benchmarks.growth import one_pass
 from benchmarks.timing import in_turns, machine, with_threads
-from pdvc.projection import project
 
 GATHERS = 4
 FLOPS_VALUE = 31
@@ -37,14 +36,20 @@ def main() -> None:
     for name, rows in (("full size", 954), ("a quarter of it", 238)):
         on = case("jailin2018", rows=rows)
         samples, rays = planes(on)
-        plain, full = in_turns([with_threads(1, _projection(on)), with_threads(1, one_pass(on))], 7)
+        plain, full = (
+            taken.cpu
+            for taken in in_turns(
+                [with_threads(1, lambda on=on: on.project(on.window, 0.4)), with_threads(1, one_pass(on))], 7
+            )
+        )
         volume = _touched_bytes(on)
         bound = {
             "gathers": GATHERS * samples / rate,
             "bytes": volume / bandwidth,
         }
         print(
-            f"{name}: {samples:.3g} samples on {rays} rays, {samples / rays:.0f} each; {1e-6 * volume:.0f} MB of volume\n"
+            f"{name}: {samples:.3g} samples on {rays} rays, {samples / rays:.0f} each; "
+            f"{1e-6 * volume:.0f} MB of volume\n"
             f"  bounds: {', '.join(f'{key} {1e3 * value:.0f} ms' for key, value in bound.items())}\n"
             f"  projection {1e3 * plain:.0f} ms, {1e9 * plain / samples:.1f} ns a sample, "
             f"{FLOPS_VALUE * samples / plain * 1e-9:.1f} Gflop/s, {plain / max(bound.values()):.1f} times the bound\n"
@@ -57,23 +62,13 @@ def main() -> None:
 def planes(on: Case) -> tuple[float, int]:
     """Return the number of planes crossed by the rays of the used window, and the number of rays that cross any."""
     window = on.window
-    rays = on.rays(window, 0.4)
-    ones = replace(on.volume, values=np.ones_like(on.volume.values))
-    still = on.basis(1)
-    image = project(
-        ones, rays, (window.rows, window.columns), still, np.zeros(still.shape), voxel_mm=ones.grid.voxel_mm
-    )
+    rays = on.rays(window, 0.4)[0]
+    image = replace(on, volume=replace(on.volume, values=np.ones_like(on.volume.values))).project(window, 0.4)
     row, column = np.arange(window.rows)[:, None, None], np.arange(window.columns)[:, None]
     along = rays[1] + row * rays[2] + column * rays[3] - rays[0]
     cosine = np.abs(along[..., :2]).max(axis=-1) / np.linalg.norm(along, axis=-1)
-    count = np.rint(image * cosine / ones.grid.voxel_mm)
+    count = np.rint(image * cosine / on.volume.grid.voxel_mm)
     return float(count.sum()), int((count > 0).sum())
-
-
-def _projection(on: Case):  # type: ignore[no-untyped-def]
-    window, still = on.window, on.basis(1)
-    rays, shape = on.rays(window, 0.4), (window.rows, window.columns)
-    return lambda: project(on.volume, rays, shape, still, np.zeros(still.shape), voxel_mm=on.volume.grid.voxel_mm)
 
 
 def _touched_bytes(on: Case) -> float:
@@ -100,7 +95,7 @@ def _gather(table, count):  # type: ignore[no-untyped-def]
 
 def _gather_rate() -> float:
     table, count = np.ones(4096, np.float32), 20_000_000
-    return count / in_turns([lambda: _gather(table, count)], 7)[0]
+    return count / in_turns([lambda: _gather(table, count)], 7)[0].cpu
 
 
 @njit(nogil=True, error_model="numpy", fastmath=True, boundscheck=False)
@@ -113,7 +108,7 @@ def _stream(values):  # type: ignore[no-untyped-def]
 
 def _bandwidth() -> float:
     values = np.ones(60_000_000, np.float32)
-    return values.nbytes / in_turns([lambda: _stream(values)], 5)[0]
+    return values.nbytes / in_turns([lambda: _stream(values)], 5)[0].cpu
 
 
 if __name__ == "__main__":

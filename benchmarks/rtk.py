@@ -10,7 +10,7 @@ source and detector columns of both coincide, and RTK's detector rows run upward
 
 from __future__ import annotations
 
-import importlib.util
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,11 @@ MISSING = "RTK is not installed: its rows are left out (pip install '.[bench]', 
 
 def available() -> bool:
     """Tell whether RTK is installed."""
-    return importlib.util.find_spec("itk") is not None and importlib.util.find_spec("itk.RTK") is not None
+    try:
+        version("itk-rtk")
+    except PackageNotFoundError:
+        return False
+    return True
 
 
 def set_threads(count: int) -> None:
@@ -41,7 +45,7 @@ def set_threads(count: int) -> None:
 class Joseph:
     """RTK's Joseph forward projection of a volume, ready to be run and timed again and again."""
 
-    def __init__(self, values: Image, grid: Grid, geometry: ConeBeam, angle_rad: Floats) -> None:
+    def __init__(self, values: Image, grid: Grid, geometry: ConeBeam, angle_rad: Floats, threads: int) -> None:
         import itk
         from itk import RTK as rtk
 
@@ -51,6 +55,7 @@ class Joseph:
         self._filter.SetInput(self._blank.GetOutput())
         self._filter.SetInput(1, _volume(values, grid))
         self._filter.SetGeometry(_geometry(geometry, angle_rad))
+        self._filter.SetNumberOfWorkUnits(threads)
 
     def run(self) -> None:
         """Project."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
 from pdvc.projection import project
 from pdvc.sections import SectionBasis
-from pdvc.volume import Hull, Volume
+from pdvc.volume import Volume
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -37,26 +39,46 @@ def normal_equations(
     still = SectionBasis(height_mm=np.zeros(1), radius_mm=1.0)
     hull = volume.hull.grown((2 + float(np.abs(amplitude).max()) * 3) * voxel_mm)
 
-    def projected(values: Image, bound: Hull) -> Image:
-        part = Volume(values=values, grid=grid, hull=bound)
-        return project(part, rays, target.shape, still, np.zeros(still.shape), voxel_mm=voxel_mm)
+    def projected(values: Image, first: int) -> Image:
+        """Project the layers of a volume from `first` on."""
+        x0, y0, z0 = grid.origin_mm
+        part = replace(grid, shape=values.shape, origin_mm=(x0, y0, z0 + first * grid.voxel_mm))
+        at_rest = np.zeros((1, *still.shape))
+        volume = Volume(values=values, grid=part, hull=hull)
+        return project(volume, rays[None], target.shape, still, at_rest, voxel_mm=voxel_mm)[0]
 
-    residual = (projected(warped, hull) - target).ravel().astype(float)
+    residual = (projected(warped, 0) - target).ravel().astype(float)
     weights = basis.weights(z)
+    layers = points.reshape(*grid.shape, 3)
     columns = []
     for j in range(basis.shape[0]):
-        within = np.flatnonzero(weights[:, j])
-        low, high = z[within[0]] - grid.voxel_mm, z[within[-1]] + grid.voxel_mm
-        bottoms = hull.z_mm + hull.slab_mm * np.arange(len(hull.support_mm))
-        used = (bottoms < high) & (bottoms + hull.slab_mm > low)
-        bound = Hull(
-            z_mm=hull.z_mm, slab_mm=hull.slab_mm, support_mm=np.where(used[:, None], hull.support_mm, -np.inf)
-        )
+        reached = np.flatnonzero(weights[:, j])
+        # one empty layer at either end, so that interpolation ends in air there too
+        first, last = max(reached[0] - 1, 0), min(reached[-1] + 2, len(z))
+        hat = weights[first:last, j, None, None] * (voxel_mm / grid.voxel_mm)
         for pattern in basis.patterns()[j]:
-            motion = points @ pattern[:, :3].T + pattern[:, 3]
-            field = sum(motion[:, i].reshape(grid.shape) * gradient[i] for i in range(3))
-            field = np.asarray(weights[:, j, None, None] * field * (voxel_mm / grid.voxel_mm), dtype=np.float32)
-            columns.append(sparse.csc_array(projected(field, bound).reshape(-1, 1), dtype=float))
+            motion = layers[first:last] @ pattern[:, :3].T + pattern[:, 3]
+            field = hat * sum(motion[..., i] * gradient[i][first:last] for i in range(3))
+            columns.append(sparse.csc_array(projected(field.astype(np.float32), first).reshape(-1, 1), dtype=float))
     stored = sparse.hstack(columns, format="csc")
     size = stored.data.nbytes + stored.indices.nbytes + stored.indptr.nbytes
     return (stored.T @ stored).toarray(), stored.T @ residual, size
+
+
+def by_differences(
+    volume: Volume, rays: Floats, basis: SectionBasis, amplitude: Floats, target: Image, voxel_mm: float
+) -> tuple[Floats, Floats]:
+    """Return B and c from S as central differences of the projection by each amplitude: slow, but no discretisation."""
+    step = 0.05
+
+    def projected(trial: Floats) -> Floats:
+        image = project(volume, rays[None], target.shape, basis, trial[None], voxel_mm=voxel_mm)[0]
+        return image.ravel().astype(float)
+
+    columns = []
+    for index in np.ndindex(basis.shape):
+        change = np.zeros(basis.shape)
+        change[index] = step
+        columns.append((projected(amplitude - change) - projected(amplitude + change)) / (2 * step))
+    stored = np.stack(columns, axis=1)
+    return stored.T @ stored, stored.T @ (projected(amplitude) - target.ravel())

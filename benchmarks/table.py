@@ -15,10 +15,10 @@ from rich.table import Table
 
 from benchmarks import rtk, stored
 from benchmarks.case import Case, amplitude, case
-from benchmarks.timing import in_turns, machine, once, with_threads
+from benchmarks.timing import Seconds, in_turns, machine, once, with_threads
 from pdvc.experiment import read_experiment
 from pdvc.measure import MeasureOptions, measure
-from pdvc.projection import normal_equations, project
+from pdvc.projection import normal_equations
 from pdvc.reconstruction import fdk
 from simulator.radiography import path_lengths
 from simulator.scanner import simulate
@@ -30,22 +30,26 @@ ANGLE_RAD = float(np.deg2rad(33.0))
 """Stage angle of the radiograph that is timed: neither along x nor along y, nor halfway between."""
 
 
+NONE = Seconds(np.nan, np.nan)
+
+
 class Rows:
     """Print a table row by row, as they come, then all together."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._table = Table("stage", "size", "threads", "time", "compared with", "its time", "ratio", "agreement")
+        self._table = Table(
+            "stage", "size", "threads", "time", "CPU", "compared with", "its time", "CPU", "ratio", "agreement"
+        )
 
     def add(
-        self, stage: str, size: str, threads: int, seconds: float, other: str = "", its: float = np.nan, note: str = ""
+        self, stage: str, size: str, threads: int, taken: Seconds, other: str = "", its: Seconds = NONE, note: str = ""
     ) -> None:
         """Add a row; the ratio is this software's time over the other's."""
-        ratio = "" if np.isnan(its) else f"{seconds / its:.2f}"
-        self._table.add_row(stage, size, str(threads), _time(seconds), other, _time(its), ratio, note)
-        self._console.print(
-            f"  {stage}, {size}, {threads} threads: {_time(seconds)} {other} {_time(its)}", style="dim"
-        )
+        ratio = "" if np.isnan(its.wall) else f"{taken.wall / its.wall:.3f}"
+        times = _time(taken.wall), _time(taken.cpu), other, _time(its.wall), _time(its.cpu)
+        self._table.add_row(stage, size, str(threads), *times, ratio, note)
+        self._console.print(f"  {stage}, {size}, {threads} thread(s): {' '.join(times)} {ratio} {note}", style="dim")
 
     def show(self) -> None:
         """Print the table."""
@@ -70,7 +74,7 @@ def main() -> None:
     console = Console(width=170)
     console.print(machine())
     if not rtk.available():
-        console.print(rtk.MISSING)
+        console.print(rtk.MISSING, markup=False)
     rows = Rows(console)
     full = case("jailin2018")
     _radiograph(rows, full, options.repeats)
@@ -85,33 +89,32 @@ def main() -> None:
 def _radiograph(rows: Rows, full: Case, repeats: int) -> None:
     """Time one radiograph's equations and projection, each beside RTK's Joseph of the same volume and window."""
     volume, voxel = full.volume, full.volume.grid.voxel_mm
-    still = full.basis(1)
     for name, window in (("whole detector", full.geometry), ("used window", full.window)):
-        shape = (window.rows, window.columns)
+        shape = (1, window.rows, window.columns)
         rays = full.rays(window, ANGLE_RAD)
         blank, weight = np.zeros(shape, np.float32), np.ones(shape, np.float32)
 
         def equations(motions: int, rays=rays, blank=blank, weight=weight) -> Callable[[], Any]:  # type: ignore[no-untyped-def]
             basis = full.basis(15, motions)
-            trial = amplitude(basis, 3.0)
+            trial = amplitude(basis, 3.0)[None]
             return lambda: normal_equations(volume, rays, basis, trial, blank, weight, voxel_mm=voxel)
 
-        def plain(rays=rays, shape=shape) -> Image:  # type: ignore[no-untyped-def]
-            return project(volume, rays, shape, still, np.zeros(still.shape), voxel_mm=voxel)
+        def plain(window=window) -> Image:  # type: ignore[no-untyped-def]
+            return full.project(window, ANGLE_RAD)
 
         for threads in (2, 1):
             jobs = [with_threads(threads, job) for job in (equations(6), equations(7), plain)]
             note = ""
             if rtk.available():
                 rtk.set_threads(threads)
-                joseph = rtk.Joseph(volume.values, volume.grid, window, np.array([ANGLE_RAD]))
+                joseph = rtk.Joseph(volume.values, volume.grid, window, np.array([ANGLE_RAD]), threads)
                 jobs.append(joseph.run)
             times = in_turns(jobs, repeats)
-            other, its = ("RTK Joseph", times[3]) if rtk.available() else ("", np.nan)
+            other, its = ("RTK Joseph", times[3]) if rtk.available() else ("", NONE)
             if rtk.available():
                 ours, theirs = plain(), joseph.result()[0]
                 note = f"rms {np.sqrt(np.mean((ours - theirs) ** 2)) / theirs.max():.1e} of the largest"
-            size = f"{shape[0]} x {shape[1]} px, {name}"
+            size = f"{shape[1]} x {shape[2]} px, {name}"
             rows.add("equations, 15 sections x 6 motions", size, threads, times[0], other, its)
             rows.add("equations, 15 sections x 7 motions", size, threads, times[1], other, its)
             rows.add("projection alone", size, threads, times[2], other, its, note)
@@ -127,13 +130,13 @@ def _reconstruction(rows: Rows, full: Case, count: int) -> None:
     few = angle[:: max(1, count // 20)]
     fdk(lambda i: views[i], geometry, few, grid, full.sample)
     seconds, ours = once(lambda: fdk(lambda i: views[i], geometry, angle, grid, full.sample))
-    other, its, note = "", np.nan, ""
+    other, its, note = "", NONE, ""
     if rtk.available():
         rtk.set_threads(2)
         run, result = rtk.fdk(views, geometry, angle, grid)
         its, _ = once(run)
         again, _ = once(lambda: fdk(lambda i: views[i], geometry, angle, grid, full.sample))
-        seconds = (seconds + again) / 2
+        seconds = Seconds((seconds.wall + again.wall) / 2, (seconds.cpu + again.cpu) / 2)
         theirs = result()
         inside = ours != 0
         level = float(theirs[theirs > 0.5 * np.percentile(theirs, 99)].mean(dtype=float))
@@ -150,16 +153,17 @@ def _stored(rows: Rows) -> None:
     basis = small.basis(15, 6)
     trial = amplitude(basis, 0.7)
     rays = small.rays(window, ANGLE_RAD)
-    weight = np.ones((window.rows, window.columns), np.float32)
-    start = project(volume, rays, weight.shape, basis, np.zeros(basis.shape), voxel_mm=voxel)
+    start = small.project(window, ANGLE_RAD)[None]
+    weight = np.ones_like(start)
     mine, plain = (
-        lambda: normal_equations(volume, rays, basis, trial, start, weight, voxel_mm=voxel),
-        lambda: stored.normal_equations(volume, rays, basis, trial, start, voxel),
+        lambda: normal_equations(volume, rays, basis, trial[None], start, weight, voxel_mm=voxel),
+        lambda: stored.normal_equations(volume, rays[0], basis, trial, start[0], voxel),
     )
     times = in_turns([mine, plain], 3)
     ours, (matrix, vector, size) = mine(), plain()
     apart = [
-        float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in ((ours.matrix, matrix), (ours.vector, vector))
+        float(np.linalg.norm(a - b) / np.linalg.norm(b))
+        for a, b in ((ours.matrix[0], matrix), (ours.vector[0], vector))
     ]
     rows.add(
         "equations, 15 sections x 6 motions",
@@ -189,8 +193,9 @@ def _measurement(rows: Rows) -> None:
         seconds, _ = once(lambda: simulate(scenario, Path(folder)))
         rows.add("simulate quick", f"{plan.reference_views} + {plan.test_steps} radiographs", 2, seconds)
         result = measure(read_experiment(Path(folder)), MeasureOptions())
-    for name, seconds in result.seconds.items():
-        rows.add(f"measure quick: {name}", f"{plan.test_steps} steps, 15 sections x 7 motions", 2, seconds)
+    for name, wall in result.seconds.items():
+        size = f"{plan.test_steps} steps, 15 sections x 7 motions"
+        rows.add(f"measure quick: {name}", size, 2, Seconds(wall, np.nan))
 
 
 if __name__ == "__main__":
