@@ -68,7 +68,7 @@ def normal_equations(
 def by_differences(
     volume: Volume, rays: Floats, basis: SectionBasis, amplitude: Floats, target: Image, voxel_mm: float
 ) -> tuple[Floats, Floats]:
-    """Return B and c from S as central differences of the projection by each amplitude: slow, but no discretisation."""
+    """Return B and c from S by central differences of the projection: slow, but no other gradient than its own."""
     step = 0.05
 
     def projected(trial: Floats) -> Floats:

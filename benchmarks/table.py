@@ -25,6 +25,7 @@ from simulator.scanner import simulate
 from simulator.scenario import course_of, load_scenario
 from simulator.views import prepare, step_image, view_image
 
+Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 ANGLE_RAD = float(np.deg2rad(33.0))
 """Stage angle of the radiograph that is timed: neither along x nor along y, nor halfway between."""
@@ -161,10 +162,12 @@ def _stored(rows: Rows) -> None:
     )
     times = in_turns([mine, plain], 3)
     ours, (matrix, vector, size) = mine(), plain()
-    apart = [
-        float(np.linalg.norm(a - b) / np.linalg.norm(b))
-        for a, b in ((ours.matrix[0], matrix), (ours.vector[0], vector))
-    ]
+    exact = stored.by_differences(volume, rays[0], basis, trial, start[0], voxel)
+
+    def apart(b: Floats, c: Floats) -> str:
+        pairs = ((ours.matrix[0], b), (ours.vector[0], c))
+        return ", ".join(f"{np.linalg.norm(mine - other) / np.linalg.norm(other):.1e}" for mine, other in pairs)
+
     rows.add(
         "equations, 15 sections x 6 motions",
         f"{window.rows} x {window.columns} px, one step of quick",
@@ -172,7 +175,7 @@ def _stored(rows: Rows) -> None:
         times[0],
         f"S stored, {size / 1e6:.0f} MB a step",
         times[1],
-        f"B {apart[0]:.1e}, c {apart[1]:.1e}",
+        f"B, c {apart(matrix, vector)}; to S by finite differences {apart(*exact)}",
     )
 
 
