@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc import gauss_newton, pgd
+from pdvc.compilation import compile_kernels
 from pdvc.equations import Equations, linearise, residuals
 from pdvc.experiment import Experiment
 from pdvc.geometry import ConeBeam
@@ -46,6 +47,8 @@ def measure(
     Raises ValueError, in one line, where the data cannot be used. `work` is a folder for intermediate results; they
     are used again only with the same experiment and options.
     """
+    compiling = time.perf_counter()
+    compile_kernels(progress=progress)
     started = time.perf_counter()
     options = resolved(options, experiment.geometry)
     window = used_window(experiment.geometry, options)
@@ -98,6 +101,7 @@ def measure(
         residual_rigid=after_rigid,
         residual_final=equations.residual,
         seconds={
+            "compile": started - compiling,
             "reconstruct": solving - started,
             "measure": ended - solving,
         },

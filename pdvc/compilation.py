@@ -1,0 +1,42 @@
+"""Compile the kernels before they are needed, so that the wait is shown as what it is.
+
+Numba keeps compiled kernels on disk beside the package (or in NUMBA_CACHE_DIR): only the first use of an
+installation compiles, later ones load.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pdvc.geometry import ConeBeam
+from pdvc.progress import Progress, silent
+from pdvc.projection import normal_equations, project
+from pdvc.rays import ray_vectors
+from pdvc.reconstruction import fdk
+from pdvc.sections import SectionBasis
+from pdvc.systematic import Systematic
+from pdvc.volume import Grid, Volume, hull_of
+
+TASK = "load or compile kernels"
+
+
+def compile_kernels(*, progress: Progress = silent) -> None:
+    """Call every kernel once on a few voxels."""
+    geometry = ConeBeam(source_axis_mm=20, source_detector_mm=40, pixel_mm=0.2, rows=6, columns=8)
+    angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
+    grid = Grid(shape=(6, 5, 7), voxel_mm=0.1, origin_mm=(-0.3, -0.2, -0.25))
+    hull = hull_of(np.ones(grid.shape, dtype=bool), grid, 2)
+    views = np.ones((len(angle), geometry.rows, geometry.columns), dtype=np.float32)
+    progress(TASK, 0, 3)
+    volume = Volume(values=fdk(lambda i: views[i], geometry, angle, grid, hull), grid=grid, hull=hull)
+    progress(TASK, 1, 3)
+    basis = SectionBasis(height_mm=np.array([-0.2, 0.2]), radius_mm=0.2)
+    rays, still = ray_vectors(geometry, angle[:1]).stacked(), np.zeros((1, *basis.shape))
+    normal_equations(volume, rays, basis, still, views[:1], views[:1], voxel_mm=0.1)
+    project(volume, rays, (geometry.rows, geometry.columns), basis, still, voxel_mm=0.1)
+    progress(TASK, 2, 3)
+    first = np.zeros(1, dtype=np.int64)
+    shape = (geometry.rows, geometry.columns)
+    systematic = Systematic(fields=views[:1], first=first, second=first, share=np.zeros(1), corner=(0, 0), shape=shape)
+    systematic.registered(slice(0, 1), rays, basis, still, 0.1)
+    progress(TASK, 3, 3)
