@@ -104,6 +104,8 @@ def prepare(
     systematic, snr_reprojection = _systematic(experiment, geometry, part, view, volume, options, progress)
     grey, variance = _test_radiographs(experiment, calibration, part, scale, progress)
     good = ~_coarse_bad(calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
+    if not good.any():
+        raise ValueError("mask: expected some used pixels, but all of the window are bad")
     weight = good[None].astype(np.float32)
     if options.weighting == "noise":
         if variance is None:
@@ -113,8 +115,6 @@ def prepare(
             )
         inverse = good / variance
         weight = np.asarray(inverse / inverse[:, good].mean(), dtype=np.float32)
-    if not good.any():
-        raise ValueError("mask: expected some used pixels, but all of the window are bad")
     return Prepared(
         images=Images(
             rays=ray_vectors(used, experiment.test.angle_rad).stacked(),
@@ -211,9 +211,8 @@ def _reached_rows(geometry: ConeBeam, volume: Volume) -> slice:
     """Return the rows whose rays stay within the volume's height where they cross the sample."""
     low, high = volume.hull.box_mm()
     radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
-    z = np.array(
-        [volume.grid.origin_mm[2], volume.grid.origin_mm[2] + volume.grid.voxel_mm * (volume.grid.shape[0] - 1)]
-    )
+    # projection.py ends rays at the first layer but one
+    z = volume.grid.origin_mm[2] + volume.grid.voxel_mm * np.array([1, volume.grid.shape[0] - 2])
     down = -z * geometry.source_detector_mm / (geometry.source_axis_mm + radius) - geometry.row_shift_mm
     rows = down / geometry.pixel_mm + (geometry.rows - 1) / 2
     return slice(max(int(np.ceil(rows[1])) + 1, 0), min(int(np.floor(rows[0])), geometry.rows))
