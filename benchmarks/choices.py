@@ -1,0 +1,64 @@
+"""Show what the choices of the default protocol do to the error of `in-space` and `quick`.
+
+Run with `python benchmarks/choices.py`; two minutes on two cores. Writes benchmarks/results/choices.csv.
+"""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+from pathlib import Path
+
+from pdvc.experiment import read_experiment
+from pdvc.history import PAPER
+from pdvc.measure import MeasureOptions, measure
+from pdvc.options import paper_options
+from pdvc.sections import RIGID
+from simulator.scanner import simulate
+from simulator.scenario import load_scenario
+from simulator.truth import read_truth
+from validation.scores import score
+
+DEFAULT = MeasureOptions()
+CHOICES = {
+    "default": DEFAULT,
+    "no contraction": DEFAULT.model_copy(update={"section_motions": RIGID}),
+    "no contraction, Table 1": DEFAULT.model_copy(update={"section_motions": RIGID, "time": PAPER}),
+    "systematic residual left": DEFAULT.model_copy(update={"subtract_systematic": False}),
+    "weighted by noise": DEFAULT.model_copy(update={"weighting": "noise"}),
+    "beam hardening left": DEFAULT.model_copy(update={"beam_hardening": "none"}),
+    "paper protocol": paper_options(),
+}
+RESULTS = Path(__file__).parent / "results" / "choices.csv"
+
+
+def main() -> None:
+    """Simulate each scenario once, measure it in every way, print and keep a table."""
+    rows = []
+    for scenario in ("in-space", "quick"):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            simulate(load_scenario(scenario), folder / "experiment")
+            experiment, truth = read_experiment(folder / "experiment"), read_truth(folder / "experiment")
+            for choice, options in CHOICES.items():
+                scores = score(measure(experiment, options, work=folder / "work"), truth)
+                row = {
+                    "scenario": scenario,
+                    "choice": choice,
+                    "final_db": f"{scores.snr_db.final:.1f}",
+                    "across_voxel": f"{scores.error_voxel.across_beam:.4f}",
+                    "vertical_voxel": f"{scores.error_voxel.vertical:.4f}",
+                    "along_voxel": f"{scores.error_voxel.along_beam:.3f}",
+                    "strain_rms": f"{scores.strain_rms:.1e}",
+                }
+                rows.append(row)
+                print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+    RESULTS.parent.mkdir(exist_ok=True)
+    with RESULTS.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
