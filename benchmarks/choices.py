@@ -1,14 +1,14 @@
 """Show what the choices of the default protocol do to the error of `in-space` and `quick`.
 
-Run with `python benchmarks/choices.py`; two minutes on two cores. Writes benchmarks/results/choices.csv.
+Run with `python -m benchmarks.choices`; two minutes on two cores. Writes benchmarks/results/choices.csv.
 """
 
 from __future__ import annotations
 
-import csv
 import tempfile
 from pathlib import Path
 
+from benchmarks.rows import Row, keep, show
 from pdvc.experiment import read_experiment
 from pdvc.history import PAPER
 from pdvc.measure import MeasureOptions, measure
@@ -29,12 +29,11 @@ CHOICES = {
     "beam hardening left": DEFAULT.model_copy(update={"beam_hardening": "none"}),
     "paper protocol": paper_options(),
 }
-RESULTS = Path(__file__).parent / "results" / "choices.csv"
 
 
 def main() -> None:
     """Simulate each scenario once, measure it in every way, print and keep a table."""
-    rows = []
+    rows: list[Row] = []
     for scenario in ("in-space", "quick"):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
@@ -42,7 +41,7 @@ def main() -> None:
             experiment, truth = read_experiment(folder / "experiment"), read_truth(folder / "experiment")
             for choice, options in CHOICES.items():
                 scores = score(measure(experiment, options, work=folder / "work"), truth)
-                row = {
+                row: Row = {
                     "scenario": scenario,
                     "choice": choice,
                     "final_db": f"{scores.snr_db.final:.1f}",
@@ -52,12 +51,8 @@ def main() -> None:
                     "strain_rms": f"{scores.strain_rms:.1e}",
                 }
                 rows.append(row)
-                print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
-    RESULTS.parent.mkdir(exist_ok=True)
-    with RESULTS.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+                show(row)
+    keep(rows, "choices")
 
 
 if __name__ == "__main__":

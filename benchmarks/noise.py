@@ -1,14 +1,14 @@
 """Show how the error of `in-space` falls with the noise, and what sets its floor.
 
-Run with `python benchmarks/noise.py`; about four minutes on two cores. Writes benchmarks/results/noise.csv.
+Run with `python -m benchmarks.noise`; about four minutes on two cores. Writes benchmarks/results/noise.csv.
 """
 
 from __future__ import annotations
 
-import csv
 import tempfile
 from pathlib import Path
 
+from benchmarks.rows import Row, keep, show
 from pdvc.experiment import read_experiment
 from pdvc.measure import MeasureOptions, measure
 from simulator.scanner import simulate
@@ -27,7 +27,6 @@ CASES = (
     (4e6, 300, 2),
 )
 """Photons for each pixel and frame, reference views, and how many times finer the pixels are."""
-RESULTS = Path(__file__).parent / "results" / "noise.csv"
 
 
 def variant(photons: float, views: int, finer: int) -> Scenario:
@@ -52,14 +51,14 @@ def variant(photons: float, views: int, finer: int) -> Scenario:
 
 def main() -> None:
     """Simulate, measure and score each variant; print and keep a table."""
-    rows = []
+    rows: list[Row] = []
     for photons, views, finer in CASES:
         with tempfile.TemporaryDirectory() as folder:
             simulate(variant(photons, views, finer), Path(folder))
             measurement = measure(read_experiment(Path(folder)), MeasureOptions())
             scores = score(measurement, read_truth(Path(folder)))
         micrometres = measurement.voxel_mm * 1e3
-        row = {
+        row: Row = {
             "photons": f"{photons:.0f}",
             "views": views,
             "voxel_um": f"{micrometres:.1f}",
@@ -73,12 +72,8 @@ def main() -> None:
             "strain_rms": f"{scores.strain_rms:.1e}",
         }
         rows.append(row)
-        print("  ".join(f"{key} {value}" for key, value in row.items()), flush=True)
-    RESULTS.parent.mkdir(exist_ok=True)
-    with RESULTS.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+        show(row)
+    keep(rows, "noise")
 
 
 if __name__ == "__main__":
