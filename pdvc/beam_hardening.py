@@ -20,10 +20,9 @@ from scipy import ndimage
 
 from pdvc.geometry import ConeBeam
 from pdvc.progress import Progress, silent
-from pdvc.projection import project
+from pdvc.projection import project_at_rest
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import fdk, seen_half_height_mm
-from pdvc.sections import SectionBasis
 from pdvc.volume import Grid, Hull, Volume, hull_of
 
 Floats = NDArray[np.float64]
@@ -133,14 +132,12 @@ def _fit(
     """Fit path length against attenuation over the middle rows of some views, mm."""
     hull = hull_of(inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
     volume = Volume(values=_framed_copy(inside), grid=grid, hull=hull)
-    still = SectionBasis(height_mm=np.zeros(1), radius_mm=1.0)
     middle = slice(geometry.rows // 5, geometry.rows - geometry.rows // 5)
     window = geometry.cropped(middle.start, middle.stop, 0, geometry.columns)
     lengths, attenuations = [], []
     for i in np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int)):
         rays = ray_vectors(window, angle_rad[i]).stacked()
-        shape = (window.rows, window.columns)
-        length = project(volume, rays, shape, still, np.zeros((1, *still.shape)), voxel_mm=grid.voxel_mm)
+        length = project_at_rest(volume, rays, (window.rows, window.columns))
         lengths.append(length.ravel())
         attenuations.append(views[i][middle].ravel())
     length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)

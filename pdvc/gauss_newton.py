@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from pdvc.equations import Equations, Linearise
-from pdvc.prior import Prior
+from pdvc.prior import Prior, solved
 from pdvc.solution import SHORTER, Solution, evaluated, lowers
 
 Floats = NDArray[np.float64]
@@ -77,10 +76,8 @@ def solve(
 
 
 def _change(equations: Equations, time_functions: Floats, coefficients: Floats, prior: Prior) -> Floats:
-    ridge = np.tile(max(equations.rms, 1e-7) ** 2 * prior.precision(), len(coefficients))
+    ridge = np.tile(prior.ridge(equations.rms), len(coefficients))
     matrix = hessian(equations, time_functions)
     matrix[np.diag_indices_from(matrix)] += ridge
     vector = (time_functions @ equations.vector).ravel() - ridge * coefficients.ravel()
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    factor = linalg.cho_factor(matrix * scale[:, None] * scale, lower=True, overwrite_a=True, check_finite=False)
-    return np.asarray(linalg.cho_solve(factor, vector * scale) * scale).reshape(coefficients.shape)
+    return solved(matrix, vector).reshape(coefficients.shape)

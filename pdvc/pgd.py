@@ -16,10 +16,9 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from pdvc.equations import Equations, Linearise
-from pdvc.prior import Prior
+from pdvc.prior import Prior, solved
 from pdvc.solution import SHORTER, Solution, evaluated, lowers
 
 Floats = NDArray[np.float64]
@@ -105,7 +104,7 @@ def find_mode(
     mode `now` already added, the mode that replaces it is returned. Without one, every time function alone is
     tried as a start, and the best is followed.
     """
-    ridge = max(equations.rms, 1e-7) ** 2 * prior.precision()
+    ridge = prior.ridge(equations.rms)
     vectors = equations.vector
     if now is not None and now[1].any():
         # linear about the present mode: chi2(m) = m B m - 2 m (c + B m_now), with m = alpha b
@@ -116,14 +115,14 @@ def find_mode(
         gains = []
         for start in np.eye(len(time_functions)):
             matrix, vector = _spatial(equations.matrix, vectors, time_functions, coefficients, ridge, start)
-            gains.append(vector @ _solved(matrix, vector))
+            gains.append(vector @ solved(matrix, vector))
         a, b = np.eye(len(time_functions))[int(np.argmax(gains))], np.zeros(coefficients.shape[1])
     for _ in range(FIXED_POINT_MOST):
         before = np.outer(a, b)
-        b = _solved(*_spatial(equations.matrix, vectors, time_functions, coefficients, ridge, a))
+        b = solved(*_spatial(equations.matrix, vectors, time_functions, coefficients, ridge, a))
         if not b.any():
             break
-        a = _solved(*_temporal(equations.matrix, vectors, time_functions, coefficients, ridge, b))
+        a = solved(*_temporal(equations.matrix, vectors, time_functions, coefficients, ridge, b))
         size = np.linalg.norm(a)
         if size == 0:
             return a, np.zeros_like(b)
@@ -169,10 +168,3 @@ def _improved(
         if lowers(equations, standing, trial, moved, prior):
             return a, b, trial
     return None
-
-
-def _solved(matrix: Floats, vector: Floats) -> Floats:
-    """Solve a small symmetric system; the prior makes it positive definite."""
-    scale = 1 / np.sqrt(np.diag(matrix))
-    factor = linalg.cho_factor(matrix * scale[:, None] * scale, lower=True, overwrite_a=True, check_finite=False)
-    return np.asarray(linalg.cho_solve(factor, vector * scale, check_finite=False) * scale)

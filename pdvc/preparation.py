@@ -14,11 +14,10 @@ from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
 from pdvc.options import MeasureOptions
 from pdvc.progress import Progress
-from pdvc.projection import project
+from pdvc.projection import project_at_rest
 from pdvc.radiographs import Calibration, binned, calibrate, coarsened, fill, grey_levels, grey_variance, snr_db
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import fdk, seen_half_height_mm
-from pdvc.sections import SectionBasis
 from pdvc.store import Store
 from pdvc.systematic import Neighbours, Systematic, neighbouring_views
 from pdvc.volume import Grid, Hull, Volume
@@ -101,7 +100,7 @@ def prepare(
     used = geometry.cropped(*part)
     view = _viewer(experiment.reference, calibration, scale)
     volume = _volume(experiment, geometry, outline, view, f"scale {scale} {options.beam_hardening}", store, progress)
-    systematic, snr_reprojection = _systematic(experiment, geometry, part, view, volume, options, progress)
+    systematic, snr_reprojection = _systematic(experiment, geometry, part, view, volume, progress)
     grey, variance = _test_radiographs(experiment, calibration, part, scale, progress)
     good = ~_coarse_bad(calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
     if not good.any():
@@ -170,7 +169,6 @@ def _systematic(
     part: tuple[int, ...],
     view: Callable[[int], Image],
     volume: Volume,
-    options: MeasureOptions,
     progress: Progress,
 ) -> tuple[Systematic, Floats]:
     """Re-project the volume at the reference views next to the steps' angles."""
@@ -178,21 +176,13 @@ def _systematic(
     near: Neighbours = neighbouring_views(reference, experiment.test.angle_rad)
     needed = np.unique(np.concatenate([near.first, near.second]))
     rays = ray_vectors(geometry, reference[needed]).stacked()
-    still = SectionBasis(height_mm=np.zeros(1), radius_mm=1.0)
     fields = np.zeros((len(needed), geometry.rows, geometry.columns), dtype=np.float32)
     snr = np.empty(len(needed))
     reached = _reached_rows(geometry, volume)
     window = (slice(part[0], part[1]), slice(part[2], part[3]))
     for n, i in enumerate(needed):
         grey = view(int(i))
-        model = project(
-            volume,
-            rays[n : n + 1],
-            (geometry.rows, geometry.columns),
-            still,
-            np.zeros((1, *still.shape)),
-            voxel_mm=geometry.voxel_mm,
-        )[0]
+        model = project_at_rest(volume, rays[n : n + 1], (geometry.rows, geometry.columns))[0]
         fields[n, reached] = (model - grey)[reached]
         snr[n] = snr_db(grey[window], fields[n][window], np.ones_like(grey[window], dtype=bool))
         progress("re-projection", n + 1, len(needed))

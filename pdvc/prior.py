@@ -6,8 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 Floats = NDArray[np.float64]
+
+LEAST_RMS = 1e-7
+"""Grey levels: data without noise still leave what single precision rounds away."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,3 +29,18 @@ class Prior:
     def precision(self) -> Floats:
         """Return 1 / deviation^2, flat (section * motion,)."""
         return np.asarray(1 / self.deviation_voxel.reshape(-1) ** 2)
+
+    def ridge(self, rms: float) -> Floats:
+        """Return what the prior adds to the diagonal of the equations, flat, at a residual of `rms` grey levels."""
+        return np.asarray(max(rms, LEAST_RMS) ** 2 * self.precision())
+
+
+def solved(matrix: Floats, right: Floats) -> Floats:
+    """Solve a symmetric system, made positive definite by a prior, for a vector or for columns.
+
+    It is scaled to a unit diagonal first, as sections that hardly show have tiny entries.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    factor = linalg.cho_factor(matrix * scale[:, None] * scale, lower=True, overwrite_a=True, check_finite=False)
+    sides = scale if right.ndim == 1 else scale[:, None]
+    return np.asarray(linalg.cho_solve(factor, right * sides, check_finite=False) * sides)

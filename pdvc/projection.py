@@ -96,6 +96,13 @@ def project(
     return _walk(volume, rays, basis, amplitude, blank, blank[:1], voxel_mm, False).residual
 
 
+def project_at_rest(volume: Volume, rays: Floats, shape: tuple[int, int]) -> Image:
+    """Return the radiographs P[F] (step, row, column), grey levels, of the volume where it is."""
+    still = SectionBasis(height_mm=np.zeros(1), radius_mm=1.0)
+    nothing = np.zeros((len(rays), *still.shape))
+    return project(volume, rays, shape, still, nothing, voxel_mm=volume.grid.voxel_mm)
+
+
 def _walk(
     volume: Volume,
     rays: Floats,

@@ -16,11 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from pdvc.equations import Equations
 from pdvc.gauss_newton import hessian
-from pdvc.prior import Prior
+from pdvc.prior import LEAST_RMS, Prior, solved
 
 Floats = NDArray[np.float64]
 
@@ -45,12 +44,11 @@ def posterior(equations: Equations, time_functions: Floats, prior: Prior) -> Pos
     shape = prior.deviation_voxel.shape
     functions, steps = time_functions.shape
     size = shape[0] * shape[1]
-    # noise-free data still leave a covariance, as small as single precision
-    gamma2 = max(equations.rms, 1e-7) ** 2
+    gamma2 = max(equations.rms, LEAST_RMS) ** 2
     precision = prior.precision()
     matrix = hessian(equations, time_functions)
-    matrix[np.diag_indices_from(matrix)] += np.tile(gamma2 * precision, functions)
-    inverse = _inverse(matrix) * gamma2
+    matrix[np.diag_indices_from(matrix)] += np.tile(prior.ridge(equations.rms), functions)
+    inverse = solved(matrix, np.eye(len(matrix))) * gamma2
     blocks = inverse.reshape(functions, size, functions, size)
     same = np.einsum("fngn->nfg", blocks)
     variance = np.einsum("ft,nfg,gt->tn", time_functions, same, time_functions, optimize=True)
@@ -61,9 +59,3 @@ def posterior(equations: Equations, time_functions: Floats, prior: Prior) -> Pos
         data_share=np.clip(1 - variance / before, 0, 1).reshape(steps, *shape),
         observed=information > UNSEEN * np.median(information),
     )
-
-
-def _inverse(matrix: Floats) -> Floats:
-    scale = 1 / np.sqrt(np.diag(matrix))
-    factor = linalg.cho_factor(matrix * scale[:, None] * scale, lower=True, check_finite=False)
-    return np.asarray(linalg.cho_solve(factor, np.diag(scale)) * scale[:, None])

@@ -67,16 +67,12 @@ def measured_at(measurement: Measurement, points_mm: Floats) -> Floats:
 
     NaN for points outside the observed sections, and for those whose motion an unobserved section shares.
     """
-    basis = measurement.basis
-    known = np.all(np.isfinite(measurement.amplitude), axis=2) & measurement.observed
+    amplitude = np.where(measurement.observed[:, None], measurement.amplitude, np.nan)
     lowest, highest = observed_range(measurement)
     result = np.empty(points_mm.shape)
     for step, points in enumerate(points_mm):
-        amplitude = np.where(known[step][:, None], measurement.amplitude[step], 0.0)
-        result[step] = basis.displacement(amplitude, points)
-        height = points[:, 2]
-        unknown = basis.weights(height)[:, ~known[step]].sum(axis=1) > 0
-        result[step, unknown | (height < lowest) | (height > highest)] = np.nan
+        result[step] = measurement.basis.displacement(amplitude[step], points)
+        result[step, (points[:, 2] < lowest) | (points[:, 2] > highest)] = np.nan
     return result
 
 
