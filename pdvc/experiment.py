@@ -7,6 +7,8 @@ A folder is readable without this software::
     test/radiographs.tif         uint16 counts (step, row, column): one radiograph per load step
     flats.tif                    uint16 counts (image, row, column), without the sample
     darks.tif                    uint16 counts (image, row, column), without X-rays
+    interrupted/NN/radiographs.tif   uint16 counts (view, row, column): a full turn while the test was held at a
+                                 step; none, or one for each [[interrupted]] entry, NN = 00, 01, ... in their order
 
 `experiment.toml` is written last, so that a folder without it is known to be unfinished.
 """
@@ -17,6 +19,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -36,6 +39,11 @@ FLATS = "flats.tif"
 DARKS = "darks.tif"
 
 Positive = Annotated[float, Field(gt=0)]
+
+
+def interrupted_stack(scan: int) -> str:
+    """Return the file, within the folder, of an interrupted scan, by its place among the [[interrupted]] entries."""
+    return f"interrupted/{scan:02d}/radiographs.tif"
 
 
 class ExperimentError(ValueError):
@@ -106,6 +114,13 @@ class StackEntry(Settings):
         return self
 
 
+class InterruptedEntry(StackEntry):
+    """A full scan of the sample while the test was held at one of its steps."""
+
+    step: Annotated[int, Field(ge=0)]
+    """step of the test, counted from 0, at which it was held"""
+
+
 class Description(Settings):
     """The whole of `experiment.toml`."""
 
@@ -121,6 +136,23 @@ class Description(Settings):
     """reference/radiographs.tif"""
     test: StackEntry
     """test/radiographs.tif"""
+    interrupted: tuple[InterruptedEntry, ...] = ()
+    """interrupted/NN/radiographs.tif, in this order: full scans while the test was held; usually none"""
+
+    @model_validator(mode="after")
+    def _held_at_steps_of_the_test(self) -> Self:
+        check_held_steps(
+            tuple(scan.step for scan in self.interrupted), len(self.test.angle_deg), "[[interrupted]] step"
+        )
+        return self
+
+
+def check_held_steps(held: tuple[int, ...], steps: int, key: str) -> None:
+    """Raise ValueError unless the steps at which a test was held are some of its steps, in order, none twice."""
+    if any(later <= earlier for earlier, later in pairwise(held)):
+        raise ValueError(f"{key}: increasing step numbers, got {', '.join(map(str, held))}")
+    if held and held[-1] >= steps:
+        raise ValueError(f"{key} below {steps}, the number of steps of the test, got {held[-1]}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,6 +167,15 @@ class Series:
 
     def __len__(self) -> int:
         return len(self.counts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InterruptedScan:
+    """Hold a full scan of the sample in the state of one step, while the test was held there."""
+
+    step: int
+    """Step of the test, counted from 0."""
+    series: Series
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +195,8 @@ class Experiment:
     test: Series
     flats: NDArray[np.uint16]
     darks: NDArray[np.uint16]
+    interrupted: tuple[InterruptedScan, ...] = ()
+    """Full scans at some steps, in the order of the steps; only volume correlation looks at them."""
 
 
 def read_experiment(folder: Path) -> Experiment:
@@ -177,6 +220,13 @@ def read_experiment(folder: Path) -> Experiment:
         test=_series(folder, TEST, description.test, "test", geometry),
         flats=_stack(folder / FLATS, geometry),
         darks=_stack(folder / DARKS, geometry),
+        interrupted=tuple(
+            InterruptedScan(
+                step=entry.step,
+                series=_series(folder, interrupted_stack(n), entry, f"interrupted.{n}", geometry),
+            )
+            for n, entry in enumerate(description.interrupted)
+        ),
     )
 
 
@@ -334,10 +384,14 @@ __all__ = [
     "Experiment",
     "ExperimentError",
     "GeometryEntry",
+    "InterruptedEntry",
+    "InterruptedScan",
     "Series",
     "SettingsError",
     "StackEntry",
     "StackWriter",
+    "check_held_steps",
+    "interrupted_stack",
     "read_experiment",
     "write_description",
 ]

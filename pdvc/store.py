@@ -41,7 +41,8 @@ class Store:
 def _fingerprint(experiment: Experiment) -> str:
     """Return a digest of the geometry, the angles and forces, and a sample of the counts."""
     digest = hashlib.sha256(repr(experiment.geometry).encode())
-    for series in (experiment.reference, experiment.test):
+    held = (scan.series for scan in experiment.interrupted)
+    for series in (experiment.reference, experiment.test, *held):
         every = max(1, len(series) // 8)
         for part in (series.angle_rad, series.force_N, series.counts[::every]):
             digest.update(np.ascontiguousarray(part).tobytes())

@@ -1,9 +1,9 @@
 """Carry out a scenario: write an experiment folder and the truth beside it.
 
-Files are written in this order: the scenario, the true displacements, flats, darks, reference scan, test, and
-last `experiment.toml`, which declares the folder complete. Every image has its own random generator, seeded
-by (seed, stack, number): counts depend neither on the number of workers nor on interruptions, and a run that
-was interrupted goes on where it stopped.
+Files are written in this order: the scenario, the true displacements, flats, darks, reference scan, test,
+interrupted scans, and last `experiment.toml`, which declares the folder complete. Every image has its own random
+generator, seeded by (seed, stack, number): counts depend neither on the number of workers nor on interruptions,
+and a run that was interrupted goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +29,17 @@ from pdvc.experiment import (
     AcquisitionEntry,
     Description,
     GeometryEntry,
+    InterruptedEntry,
     StackEntry,
     StackWriter,
+    interrupted_stack,
     write_description,
 )
 from pdvc.progress import Progress, silent
 from simulator.detector import expose_dark, expose_flat
 from simulator.scenario import Course, Scenario, course_of
 from simulator.truth import DISPLACEMENT, SCENARIO, read_scenario, sample_truth, write_scenario, write_truth
-from simulator.views import Image, prepare, step_image, stream, view_image
+from simulator.views import Image, interrupted_image, moved_body, prepare, step_image, stream, view_image
 
 Floats = NDArray[np.float64]
 
@@ -52,7 +55,7 @@ def simulate(scenario: Scenario, folder: Path, *, progress: Progress = silent, w
     Raises SimulationError where the folder holds something else or the disk is full.
     """
     check_folder(scenario, folder)
-    if all((folder / name).is_file() for name in (DESCRIPTION, DISPLACEMENT, FLATS, DARKS, REFERENCE, TEST)):
+    if all((folder / name).is_file() for name in (DESCRIPTION, DISPLACEMENT, *_stacks(scenario))):
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -107,14 +110,36 @@ def _write_all(scenario: Scenario, folder: Path, progress: Progress, workers: in
         ("reference", REFERENCE, scenario.acquisition.reference_views, lambda k: view_image(scanner, k)),
         ("test", TEST, scenario.acquisition.test_steps, lambda k: step_image(scanner, k)),
     )
-    shape = scenario.geometry.rows, scenario.geometry.columns
     for task, name, count, make in stacks:
-        with StackWriter(folder / name, (count, *shape)) as writer:
-            progress(task, writer.done, count)
-            for index, image in in_order(make, range(writer.done, count), workers):
-                writer.write(index, image)
-                progress(task, writer.done, count)
+        _write_stack(scenario, folder / name, task, count, make, progress, workers)
+    views = len(course.interrupted_angle_rad)
+    for n, step in enumerate(scenario.interrupted.steps):
+        make = partial(interrupted_image, scanner, moved_body(scanner.body, course.motion, step), step)
+        path, task = folder / interrupted_stack(n), f"scan at step {step}"
+        _write_stack(scenario, path, task, views, make, progress, workers)
     write_description(folder, describe(scenario, course))
+
+
+def _write_stack(
+    scenario: Scenario,
+    path: Path,
+    task: str,
+    count: int,
+    make: Callable[[int], Image],
+    progress: Progress,
+    workers: int,
+) -> None:
+    with StackWriter(path, (count, scenario.geometry.rows, scenario.geometry.columns)) as writer:
+        progress(task, writer.done, count)
+        for index, image in in_order(make, range(writer.done, count), workers):
+            writer.write(index, image)
+            progress(task, writer.done, count)
+
+
+def _stacks(scenario: Scenario) -> tuple[str, ...]:
+    """Return the files of all stacks that a scenario makes."""
+    held = (interrupted_stack(n) for n in range(len(scenario.interrupted.steps)))
+    return FLATS, DARKS, REFERENCE, TEST, *held
 
 
 def in_order(make: Callable[[int], Image], indices: range, workers: int) -> Iterator[tuple[int, Image]]:
@@ -151,7 +176,16 @@ def describe(scenario: Scenario, course: Course) -> Description:
         ),
         reference=_stack_entry(course.reference_angle_rad, course.reference_time_s, at_rest),
         test=_stack_entry(course.test_angle_rad, course.test_time_s, force),
+        interrupted=tuple(_interrupted_entry(scenario, course, n) for n in range(len(course.interrupted_time_s))),
     )
+
+
+def _interrupted_entry(scenario: Scenario, course: Course, scan: int) -> InterruptedEntry:
+    step, time_s = scenario.interrupted.steps[scan], course.interrupted_time_s[scan]
+    noise = stream(scenario, "interrupted force", step).standard_normal(len(time_s))
+    force = course.history.force_N[step] + scenario.acquisition.force_noise_N * noise
+    stack = _stack_entry(course.interrupted_angle_rad, time_s, force)
+    return InterruptedEntry(step=step, **stack.model_dump())
 
 
 def _stack_entry(angle_rad: Floats, time_s: Floats, force_N: Floats) -> StackEntry:
@@ -164,5 +198,7 @@ def _stack_entry(angle_rad: Floats, time_s: Floats, force_N: Floats) -> StackEnt
 
 def _size_mb(scenario: Scenario) -> float:
     plan, detector = scenario.acquisition, scenario.detector
+    held = scenario.interrupted
     images = plan.reference_views + plan.test_steps + detector.flats + detector.darks
+    images += len(held.steps) * (held.views or plan.reference_views)
     return images * scenario.geometry.rows * scenario.geometry.columns * 2e-6 + 10

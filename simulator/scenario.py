@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pdvc.experiment import GeometryEntry
+from pdvc.experiment import GeometryEntry, check_held_steps
 from pdvc.geometry import ConeBeam
 from pdvc.settings import Settings, SettingsError
 from simulator.detector import Detector
@@ -101,6 +101,20 @@ class Acquisition(Settings):
     """standard deviation of the recorded force, N"""
 
 
+class Interrupted(Settings):
+    """Full scans on the way, as classical volume correlation needs them: the test is held, the sample does not move.
+
+    All motion stands still meanwhile, also the stage's wobble and what a held sample would creep.
+    """
+
+    steps: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """steps of the test, counted from 0, at which the sample is scanned over a full turn; usually none"""
+    views: Annotated[int, Field(ge=1)] | None = None
+    """radiographs of each scan; default: acquisition.reference_views"""
+    view_s: Positive | None = None
+    """time from one of its radiographs to the next, s; default: acquisition.reference_view_s"""
+
+
 class Scenario(Settings):
     """A synthetic experiment: sample, scanner, acquisition, loading and motion."""
 
@@ -128,6 +142,8 @@ class Scenario(Settings):
     """the detector"""
     acquisition: Acquisition = Acquisition()
     """when radiographs are taken"""
+    interrupted: Interrupted = Interrupted()
+    """full scans while the test is held"""
     loading: Loading = Loading()
     """the tensile test"""
     motion: MotionOptions = MotionOptions()
@@ -144,6 +160,7 @@ class Scenario(Settings):
                 f"specimen.length_mm of at least {2 * self.visible_mm:.4g} mm, so that the sample's ends stay out "
                 f"of sight, got {self.specimen.length_mm} mm"
             )
+        check_held_steps(self.interrupted.steps, self.acquisition.test_steps, "interrupted.steps")
         return self
 
     @property
@@ -169,6 +186,10 @@ class Course:
     reference_time_s: Floats
     test_angle_rad: Floats
     test_time_s: Floats
+    interrupted_angle_rad: Floats
+    """Stage angles of each interrupted scan (view,)."""
+    interrupted_time_s: Floats
+    """Times of the interrupted scans (scan, view); the test's own clock stands still meanwhile."""
     history: LoadHistory
     """Force and strain at each step of the test."""
     motion: Motion
@@ -190,11 +211,16 @@ def course_of(scenario: Scenario) -> Course:
     if scenario.motion.sections:
         levels = np.linspace(-scenario.view_mm, scenario.view_mm, scenario.motion.sections)
         motion = into_sections(motion, levels, time_functions(history.force_N, angle, stroke_step))
+    held = scenario.interrupted
+    held_views = np.arange(held.views or plan.reference_views, dtype=float)
+    held_from_s = history.time_s[list(held.steps)]
     return Course(
         reference_angle_rad=start + 2 * np.pi * views / plan.reference_views,
         reference_time_s=plan.reference_view_s * views,
         test_angle_rad=angle,
         test_time_s=history.time_s,
+        interrupted_angle_rad=start + 2 * np.pi * held_views / len(held_views),
+        interrupted_time_s=held_from_s[:, None] + (held.view_s or plan.reference_view_s) * held_views,
         history=history,
         motion=motion,
     )

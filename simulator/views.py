@@ -19,7 +19,7 @@ from simulator.xray import TransmissionTable
 
 Image = NDArray[np.uint16]
 
-_STREAMS = ("reference", "test", "flats", "darks", "nodules", "maps", "force")
+_STREAMS = ("reference", "test", "flats", "darks", "nodules", "maps", "force", "interrupted", "interrupted force")
 """Random numbers are drawn from one stream for each of these; the order is part of every result."""
 
 
@@ -110,9 +110,16 @@ def step_image(scanner: Scanner, step: int) -> Image:
     return _exposed(scanner, image, "test", step)
 
 
-def _exposed(scanner: Scanner, image: NDArray[np.float32], stack: str, index: int) -> Image:
+def interrupted_image(scanner: Scanner, held: Body, step: int, view: int) -> Image:
+    """Make one radiograph of the scan at a step, counts (row, column); `held` is `moved_body` of that step."""
+    angles = scanner.course.interrupted_angle_rad
+    image = transmission(scanner, held, float(angles[view]), 2 * math.pi / len(angles))
+    return _exposed(scanner, image, "interrupted", step, view)
+
+
+def _exposed(scanner: Scanner, image: NDArray[np.float32], stack: str, *index: int) -> Image:
     scenario = scanner.scenario
-    rng = stream(scenario, stack, index)
+    rng = stream(scenario, stack, *index)
     return expose(image, scenario.detector, scanner.maps, scenario.acquisition.subpixels, rng)
 
 
@@ -130,7 +137,7 @@ def _lean(body: Body, lean_rad: float, angle_rad: float) -> Body:
     )
 
 
-def stream(scenario: Scenario, name: str, index: int = 0) -> np.random.Generator:
-    """Return the generator of one image, or of one other random thing."""
-    key = (_STREAMS.index(name), index)
+def stream(scenario: Scenario, name: str, *index: int) -> np.random.Generator:
+    """Return the generator of one image, or of one other random thing; of the first one without an index."""
+    key = (_STREAMS.index(name), *(index or (0,)))
     return np.random.default_rng(np.random.SeedSequence(scenario.seed, spawn_key=key))

@@ -11,9 +11,11 @@ from pdvc.experiment import (
     Description,
     ExperimentError,
     GeometryEntry,
+    InterruptedEntry,
     SettingsError,
     StackEntry,
     StackWriter,
+    interrupted_stack,
     read_experiment,
     write_description,
 )
@@ -82,6 +84,59 @@ def test_a_folder_reads_back_as_it_was_written(folder):
     np.testing.assert_allclose(experiment.test.angle_rad, [0, 2 * np.pi / 3, 4 * np.pi / 3])
     np.testing.assert_array_equal(experiment.test.time_s, [0, 2, 4])
     np.testing.assert_array_equal(experiment.test.force_N, [250, 251, 252])
+
+
+def with_scans(folder, *steps, views=4):
+    """Add interrupted scans of `views` radiographs to a folder, and return their counts."""
+    stacks = [np.random.default_rng(step).integers(0, 65536, (views, ROWS, COLUMNS), np.uint16) for step in steps]
+    entries = tuple(InterruptedEntry(step=step, **entry(views).model_dump()) for step in steps)
+    for n, stack in enumerate(stacks):
+        write_stack(folder / interrupted_stack(n), stack)
+    write_description(folder, DESCRIPTION.model_copy(update={"interrupted": entries}))
+    return stacks
+
+
+def test_interrupted_scans_read_back_as_they_were_written_and_stay_on_disk(folder):
+    stacks = with_scans(folder, 0, 2)
+    found = read_experiment(folder).interrupted
+    assert [scan.step for scan in found] == [0, 2]
+    for scan, stack in zip(found, stacks, strict=True):
+        assert isinstance(scan.series.counts, np.memmap)
+        np.testing.assert_array_equal(scan.series.counts, stack)
+        np.testing.assert_allclose(scan.series.angle_rad, [0, np.pi / 2, np.pi, 3 * np.pi / 2])
+        np.testing.assert_array_equal(scan.series.force_N, [250, 251, 252, 253])
+    assert (folder / "interrupted/01/radiographs.tif").is_file()
+
+
+def test_a_description_that_knows_no_interrupted_scans_reads_as_before(folder):
+    path = folder / "experiment.toml"
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("interrupted")]
+    assert len(lines) == len(path.read_text().splitlines()) - 1
+    path.write_text("\n".join(lines))
+    assert read_experiment(folder).interrupted == ()
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [
+        ((0, 3), r"[[interrupted]] step below 3, the number of steps of the test, got 3"),
+        ((2, 1), r"[[interrupted]] step: increasing step numbers, got 2, 1"),
+        ((1, 1), r"[[interrupted]] step: increasing step numbers, got 1, 1"),
+    ],
+)
+def test_scans_at_steps_that_the_test_has_not_are_refused(folder, steps, message):
+    with_scans(folder, *steps)
+    assert message in refused(folder, SettingsError)
+
+
+def test_a_missing_or_short_interrupted_scan_is_named(folder):
+    with_scans(folder, 0, 2)
+    (folder / interrupted_stack(0)).unlink()
+    assert "interrupted/00/radiographs.tif: expected a TIFF stack, found none" in refused(folder)
+    write_stack(folder / interrupted_stack(0), np.zeros((3, ROWS, COLUMNS), np.uint16))
+    text = refused(folder)
+    assert "interrupted/00/radiographs.tif: expected 4 radiographs, one for each interrupted.0.angle_deg" in text
+    assert "found 3" in text
 
 
 def test_stacks_stay_on_disk(folder):

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, read_experiment
+from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, interrupted_stack, read_experiment
 from pdvc.settings import SettingsError
 from simulator import scanner
+from simulator.detector import expected
 from simulator.scanner import SimulationError, in_order, simulate
 from simulator.scenario import Scenario, course_of
 from simulator.truth import DISPLACEMENT, read_scenario, read_truth
-from simulator.views import moved_body, prepare, step_image, transmission
+from simulator.views import interrupted_image, moved_body, prepare, step_image, transmission
 
 
 def tiny(**changes):
@@ -223,3 +224,100 @@ def test_an_error_in_one_image_surfaces():
 def test_images_can_be_made_one_at_a_time(folder):
     bench = prepare(tiny(), course_of(tiny()))
     np.testing.assert_array_equal(step_image(bench, 7), tifffile.imread(folder / TEST)[7])
+
+
+HELD = {"steps": (0, 13), "views": 10, "view_s": 3.0}
+
+
+@pytest.fixture(scope="module")
+def held_folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("held") / "experiment"
+    simulate(tiny(interrupted=HELD), path, workers=2)
+    return path
+
+
+def test_interrupted_scans_are_recorded_with_step_angle_time_and_force(held_folder):
+    scans = read_experiment(held_folder).interrupted
+    history = course_of(tiny()).history
+    assert [scan.step for scan in scans] == [0, 13]
+    for scan in scans:
+        assert scan.series.counts.shape == (10, 40, 24)
+        np.testing.assert_allclose(scan.series.angle_rad, 2 * np.pi * np.arange(10) / 10, atol=1e-11)
+        np.testing.assert_allclose(scan.series.time_s, history.time_s[scan.step] + 3.0 * np.arange(10))
+        np.testing.assert_allclose(scan.series.force_N, history.force_N[scan.step], atol=5)
+        assert len(set(scan.series.force_N)) == 10
+
+
+def test_interrupted_scans_change_no_other_count_and_no_recorded_force(folder, held_folder):
+    for one, two in zip(stacks(held_folder), stacks(folder), strict=True):
+        np.testing.assert_array_equal(one, two)
+    plain, held = read_experiment(folder), read_experiment(held_folder)
+    np.testing.assert_array_equal(plain.reference.force_N, held.reference.force_N)
+    np.testing.assert_array_equal(plain.test.force_N, held.test.force_N)
+
+
+def test_by_default_an_interrupted_scan_is_taken_like_the_reference_scan():
+    course = course_of(tiny(interrupted={"steps": (4,)}))
+    np.testing.assert_array_equal(course.interrupted_angle_rad, course.reference_angle_rad)
+    expected_s = course.history.time_s[4] + course.reference_time_s
+    np.testing.assert_allclose(course.interrupted_time_s, expected_s[None])
+
+
+def test_a_view_at_the_angle_of_the_held_step_shows_what_the_step_shows():
+    """Steps turn by a tenth of a turn, and so do these views: view 3 stands where step 13 stands."""
+    quiet = tiny(interrupted=HELD, detector={"photons_per_pixel": 1e9, "readout_noise_counts": 0.0})
+    bench = prepare(quiet, course_of(quiet))
+    held = moved_body(bench.body, bench.course.motion, 13)
+    scan, step = interrupted_image(bench, held, 13, 3), step_image(bench, 13)
+    noise_free = expected(transmission(bench, held, 2 * np.pi * 13 / 10, 0.0), quiet.detector, bench.maps, 2)
+    for image in (scan, step):
+        # photon noise is 40000 / sqrt(5e9) = 0.6 counts at most, and rounding adds as much
+        assert np.abs(image - np.clip(noise_free, 0, 65535)).max() < 5
+    assert not np.array_equal(scan, step)
+
+
+def test_without_motion_an_interrupted_scan_differs_from_the_reference_scan_by_its_noise_alone(tmp_path):
+    still = tiny(motion={"ingredients": []}, interrupted={"steps": (3, 19)}, detector={"bad_pixel_fraction": 0.0})
+    simulate(still, tmp_path)
+    experiment = read_experiment(tmp_path)
+    reference = experiment.reference.counts.astype(float)
+    one, two = (scan.series.counts.astype(float) for scan in experiment.interrupted)
+    dark = still.detector.dark_counts
+    variance = ((reference - dark) / experiment.photons_per_count + experiment.readout_noise_counts**2) / 5
+    for image, other in ((one, reference), (two, reference), (one, two)):
+        score = (image - other) / np.sqrt(2 * variance)
+        # 19200 independent normal deviates: mean within 1 / sqrt(19200) = 0.007, deviation within half of that
+        assert abs(score.mean()) < 0.03
+        assert score.std() == pytest.approx(1, abs=0.03)
+        assert abs((score[:, :, 1:] * score[:, :, :-1]).mean()) < 0.03
+
+
+def test_an_interrupted_scan_that_was_interrupted_itself_goes_on_to_the_same_counts(held_folder, tmp_path):
+    def interrupt(name, done, total):
+        if (name, done) == ("scan at step 13", 4):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(tiny(interrupted=HELD), tmp_path, progress=interrupt, workers=2)
+    assert not (tmp_path / DESCRIPTION).exists()
+    simulate(tiny(interrupted=HELD), tmp_path, workers=1)
+    for n in range(2):
+        np.testing.assert_array_equal(
+            tifffile.imread(tmp_path / interrupted_stack(n)), tifffile.imread(held_folder / interrupted_stack(n))
+        )
+
+
+def test_a_folder_that_lost_an_interrupted_scan_is_completed(held_folder, tmp_path):
+    simulate(tiny(interrupted=HELD), tmp_path)
+    (tmp_path / interrupted_stack(1)).unlink()
+    simulate(tiny(interrupted=HELD), tmp_path)
+    np.testing.assert_array_equal(
+        tifffile.imread(tmp_path / interrupted_stack(1)), tifffile.imread(held_folder / interrupted_stack(1))
+    )
+
+
+def test_the_noise_of_a_scan_depends_on_its_step_not_on_the_other_scans(held_folder):
+    alone = tiny(interrupted={**HELD, "steps": (13,)})
+    bench = prepare(alone, course_of(alone))
+    image = interrupted_image(bench, moved_body(bench.body, bench.course.motion, 13), 13, 2)
+    np.testing.assert_array_equal(image, tifffile.imread(held_folder / interrupted_stack(1))[2])

@@ -58,6 +58,10 @@ def test_quick_is_the_paper_four_times_coarser():
         ('[motion]\ningredients = ["swim"]', r"motion\.ingredients\.0: expected 'tension', .*, given 'swim'"),
         ("[specimen]\nlength_mm = 5.0", r"expected specimen\.length_mm of at least 10\.\d+ mm"),
         ("discarded_rows = 477", r"discarded_rows below half of the 954 detector rows, got 477"),
+        ("[interrupted]\nsteps = [0, 127]", r"expected interrupted\.steps below 127, the number of steps of the test"),
+        ("[interrupted]\nsteps = [5, 4]", r"expected interrupted\.steps: increasing step numbers, got 5, 4"),
+        ("[interrupted]\nsteps = [-1]", r"interrupted\.steps\.0: expected greater than or equal to 0, given -1"),
+        ("[interrupted]\nviews = 0", r"interrupted\.views: expected greater than or equal to 1, given 0"),
         ("[motion", r"not valid TOML"),
     ],
 )
