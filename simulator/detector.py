@@ -122,7 +122,27 @@ def expose(
 
     Returns counts (rows, columns): the mean of `frames` frames, in the order of the module's head.
     """
-    photons = _photons(transmission, detector, maps, subpixels) * detector.frames
+    return record(seen(transmission, detector, maps, subpixels), detector, maps, rng)
+
+
+def seen(
+    transmission: NDArray[np.float32], detector: Detector, maps: DetectorMaps, subpixels: int
+) -> NDArray[np.float32]:
+    """Return I (rows, columns), the share of the open beam in each pixel: all of an image that has no noise.
+
+    It depends on no setting of the detector but `blur_px`.
+    """
+    wanted = (maps.gain.shape[0] * subpixels, maps.gain.shape[1] * subpixels)
+    if transmission.shape != wanted:
+        raise ValueError(f"transmission: expected shape {wanted}, got {transmission.shape}")
+    return pixel_means(transmission, subpixels, detector.blur_px)
+
+
+def record(
+    image: NDArray[np.float32], detector: Detector, maps: DetectorMaps, rng: np.random.Generator
+) -> NDArray[np.uint16]:
+    """Make one stored image, counts (rows, columns), from what its pixels see, as `seen` returns it."""
+    photons = _photons(image, detector, maps) * detector.frames
     detected = rng.poisson(photons).astype(np.float32)
     counts = _counts(detected / np.float32(detector.frames), detector, maps)
     deviation = detector.readout_noise_counts / math.sqrt(detector.frames)
@@ -144,7 +164,7 @@ def expected(
     transmission: NDArray[np.float32], detector: Detector, maps: DetectorMaps, subpixels: int
 ) -> NDArray[np.float32]:
     """Return the noise-free counts (rows, columns) of an image, bad pixels too, neither rounded nor clipped."""
-    counts = _counts(_photons(transmission, detector, maps, subpixels), detector, maps)
+    counts = _counts(_photons(seen(transmission, detector, maps, subpixels), detector, maps), detector, maps)
     return np.where(maps.hot, np.float32(_FULL_SCALE), counts)
 
 
@@ -166,15 +186,9 @@ def pixel_means(image: NDArray[np.float32], subpixels: int, blur_px: float) -> N
     return _down_rows(across, kernel, subpixels, reach)
 
 
-def _photons(
-    transmission: NDArray[np.float32], detector: Detector, maps: DetectorMaps, subpixels: int
-) -> NDArray[np.float32]:
+def _photons(image: NDArray[np.float32], detector: Detector, maps: DetectorMaps) -> NDArray[np.float32]:
     """Return the photons expected in each pixel during one frame."""
-    wanted = (maps.gain.shape[0] * subpixels, maps.gain.shape[1] * subpixels)
-    if transmission.shape != wanted:
-        raise ValueError(f"transmission: expected shape {wanted}, got {transmission.shape}")
-    seen = pixel_means(transmission, subpixels, detector.blur_px)
-    photons: NDArray[np.float32] = np.float32(detector.photons_per_pixel) * maps.beam * seen
+    photons: NDArray[np.float32] = np.float32(detector.photons_per_pixel) * maps.beam * image
     return photons
 
 

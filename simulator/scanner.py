@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,10 +34,23 @@ from pdvc.experiment import (
     write_description,
 )
 from pdvc.progress import Progress, silent
-from simulator.detector import expose_dark, expose_flat
+from simulator.clean import clean_stack
+from simulator.detector import DetectorMaps, expose_dark, expose_flat
 from simulator.scenario import Course, Scenario, course_of
+from simulator.side_by_side import in_order
 from simulator.truth import DISPLACEMENT, SCENARIO, read_scenario, sample_truth, write_scenario, write_truth
-from simulator.views import Image, interrupted_image, moved_body, prepare, step_image, stream, view_image
+from simulator.views import (
+    Clear,
+    Image,
+    Stack,
+    clear_images,
+    exposed,
+    image_count,
+    maps_of,
+    prepare,
+    stacks_of,
+    stream,
+)
 
 Floats = NDArray[np.float64]
 
@@ -48,20 +59,29 @@ class SimulationError(ValueError):
     """Say why a scenario cannot be carried out in a folder, and what to do."""
 
 
-def simulate(scenario: Scenario, folder: Path, *, progress: Progress = silent, workers: int | None = None) -> None:
+def simulate(
+    scenario: Scenario,
+    folder: Path,
+    *,
+    progress: Progress = silent,
+    workers: int | None = None,
+    clean: Path | None = None,
+) -> None:
     """Carry out a scenario and write its experiment folder, or go on with it where it was interrupted.
 
-    `workers` radiographs are computed side by side, by default as many as there are processors.
+    `workers` radiographs are computed side by side, by default as many as there are processors. `clean` is a folder
+    in which noise-free radiographs are kept, and found again by other scenarios that differ in nothing but noise
+    (`simulator.clean`); counts do not depend on it.
     Raises SimulationError where the folder holds something else or the disk is full.
     """
     check_folder(scenario, folder)
-    if all((folder / name).is_file() for name in (DESCRIPTION, DISPLACEMENT, *_stacks(scenario))):
+    if all((folder / name).is_file() for name in (DESCRIPTION, DISPLACEMENT, FLATS, DARKS, *_stacks(scenario))):
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / DESCRIPTION).unlink(missing_ok=True)
         write_scenario(folder, scenario)
-        _write_all(scenario, folder, progress, workers or os.cpu_count() or 1)
+        _write_all(scenario, folder, progress, workers or os.cpu_count() or 1, clean)
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
@@ -97,27 +117,37 @@ def first_difference(one: dict[str, Any], other: dict[str, Any]) -> str:
     return ""
 
 
-def _write_all(scenario: Scenario, folder: Path, progress: Progress, workers: int) -> None:
+def _write_all(scenario: Scenario, folder: Path, progress: Progress, workers: int, clean: Path | None) -> None:
     progress("sample", 0, 1)
     course = course_of(scenario)
     write_truth(folder, sample_truth(scenario, course))
-    scanner = prepare(scenario, course)
-    detector, maps = scenario.detector, scanner.maps
+    detector, maps = scenario.detector, maps_of(scenario)
+    clear_of = _clear_stacks(scenario, course, progress, workers, clean)
     progress("sample", 1, 1)
-    stacks: tuple[tuple[str, str, int, Callable[[int], Image]], ...] = (
+    without_sample: tuple[tuple[str, str, int, Callable[[int], Image]], ...] = (
         ("flats", FLATS, detector.flats, lambda k: expose_flat(detector, maps, stream(scenario, "flats", k))),
         ("darks", DARKS, detector.darks, lambda k: expose_dark(detector, maps, stream(scenario, "darks", k))),
-        ("reference", REFERENCE, scenario.acquisition.reference_views, lambda k: view_image(scanner, k)),
-        ("test", TEST, scenario.acquisition.test_steps, lambda k: step_image(scanner, k)),
     )
-    for task, name, count, make in stacks:
+    for task, name, count, make in without_sample:
         _write_stack(scenario, folder / name, task, count, make, progress, workers)
-    views = len(course.interrupted_angle_rad)
-    for n, step in enumerate(scenario.interrupted.steps):
-        make = partial(interrupted_image, scanner, moved_body(scanner.body, course.motion, step), step)
-        path, task = folder / interrupted_stack(n), f"scan at step {step}"
-        _write_stack(scenario, path, task, views, make, progress, workers)
+    for stack, name in zip(stacks_of(scenario), _stacks(scenario), strict=True):
+        make = partial(_noisy, scenario, maps, clear_of(stack), stack)
+        _write_stack(scenario, folder / name, str(stack), image_count(scenario, stack), make, progress, workers)
     write_description(folder, describe(scenario, course))
+
+
+def _clear_stacks(
+    scenario: Scenario, course: Course, progress: Progress, workers: int, clean: Path | None
+) -> Callable[[Stack], Callable[[int], Clear]]:
+    """Return the function that gives for each stack its images without noise, by their numbers."""
+    if clean is None:
+        return partial(clear_images, prepare(scenario, course))
+    folder = clean
+    return lambda stack: clean_stack(scenario, stack, folder, progress=progress, workers=workers).__getitem__
+
+
+def _noisy(scenario: Scenario, maps: DetectorMaps, clear: Callable[[int], Clear], stack: Stack, index: int) -> Image:
+    return exposed(scenario, maps, clear(index), stack, index)
 
 
 def _write_stack(
@@ -137,26 +167,8 @@ def _write_stack(
 
 
 def _stacks(scenario: Scenario) -> tuple[str, ...]:
-    """Return the files of all stacks that a scenario makes."""
-    held = (interrupted_stack(n) for n in range(len(scenario.interrupted.steps)))
-    return FLATS, DARKS, REFERENCE, TEST, *held
-
-
-def in_order(make: Callable[[int], Image], indices: range, workers: int) -> Iterator[tuple[int, Image]]:
-    """Compute images side by side and yield them in order, a few ahead at most: memory stays bounded."""
-    waiting: deque[tuple[int, Future[Image]]] = deque()
-    pool = ThreadPoolExecutor(workers)
-    try:
-        for index in indices:
-            waiting.append((index, pool.submit(make, index)))
-            if len(waiting) > workers + 1:
-                first, future = waiting.popleft()
-                yield first, future.result()
-        while waiting:
-            first, future = waiting.popleft()
-            yield first, future.result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    """Return the files of the stacks that a scenario makes with the sample in the beam."""
+    return REFERENCE, TEST, *(interrupted_stack(n) for n in range(len(scenario.interrupted.steps)))
 
 
 def describe(scenario: Scenario, course: Course) -> Description:

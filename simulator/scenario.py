@@ -126,6 +126,8 @@ class Scenario(Settings):
     """what the sample is made of, for the reader"""
     seed: Annotated[int, Field(ge=0)] = 0
     """of all randomness: nodules, detector and noise"""
+    repetition: Annotated[int, Field(ge=0)] = 0
+    """number of the noise draw: other noise of images and of the recorded force, same sample and same detector"""
     discarded_rows: Annotated[int, Field(ge=0)] = 100
     """rows at the top and at the bottom that a measurement leaves out; sets the height that motion refers to"""
     specimen: Specimen = Specimen()

@@ -8,10 +8,11 @@ from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, interrupted_sta
 from pdvc.settings import SettingsError
 from simulator import scanner
 from simulator.detector import expected
-from simulator.scanner import SimulationError, in_order, simulate
+from simulator.scanner import SimulationError, simulate
 from simulator.scenario import Scenario, course_of
+from simulator.side_by_side import in_order
 from simulator.truth import DISPLACEMENT, read_scenario, read_truth
-from simulator.views import interrupted_image, moved_body, prepare, step_image, transmission
+from simulator.views import Stack, clear_images, exposed, moved_body, prepare, step_image, transmission
 
 
 def tiny(**changes):
@@ -263,12 +264,17 @@ def test_by_default_an_interrupted_scan_is_taken_like_the_reference_scan():
     np.testing.assert_allclose(course.interrupted_time_s, expected_s[None])
 
 
+def held_image(bench, step, view):
+    stack = Stack("interrupted", step)
+    return exposed(bench.scenario, bench.maps, clear_images(bench, stack)(view), stack, view)
+
+
 def test_a_view_at_the_angle_of_the_held_step_shows_what_the_step_shows():
     """Steps turn by a tenth of a turn, and so do these views: view 3 stands where step 13 stands."""
     quiet = tiny(interrupted=HELD, detector={"photons_per_pixel": 1e9, "readout_noise_counts": 0.0})
     bench = prepare(quiet, course_of(quiet))
     held = moved_body(bench.body, bench.course.motion, 13)
-    scan, step = interrupted_image(bench, held, 13, 3), step_image(bench, 13)
+    scan, step = held_image(bench, 13, 3), step_image(bench, 13)
     noise_free = expected(transmission(bench, held, 2 * np.pi * 13 / 10, 0.0), quiet.detector, bench.maps, 2)
     for image in (scan, step):
         # photon noise is 40000 / sqrt(5e9) = 0.6 counts at most, and rounding adds as much
@@ -319,5 +325,5 @@ def test_a_folder_that_lost_an_interrupted_scan_is_completed(held_folder, tmp_pa
 def test_the_noise_of_a_scan_depends_on_its_step_not_on_the_other_scans(held_folder):
     alone = tiny(interrupted={**HELD, "steps": (13,)})
     bench = prepare(alone, course_of(alone))
-    image = interrupted_image(bench, moved_body(bench.body, bench.course.motion, 13), 13, 2)
+    image = held_image(bench, 13, 2)
     np.testing.assert_array_equal(image, tifffile.imread(held_folder / interrupted_stack(1))[2])

@@ -1,0 +1,88 @@
+"""Noise-free radiographs kept by content, so that scenarios that differ in nothing but noise share them.
+
+A stack is kept as ``reference-KEY.npy``, ``test-KEY.npy`` or ``interrupted-KEY.npy``, float32 (image, row, column):
+the share of the open beam that each pixel sees, as `simulator.detector.seen` returns it. KEY is a digest of exactly
+those parts of a scenario that the stack depends on, and of this software's version: not of photons, frames, readout,
+gain, flats or repetition. Each stack has a key of its own, so that what changes the test alone, as its motion does,
+leaves the reference scan.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import uuid
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.progress import Progress, silent
+from simulator.scenario import Scenario, course_of
+from simulator.side_by_side import in_order
+from simulator.views import Stack, clear_images, image_count, prepare
+from simulator.xray import read_spectrum
+
+_EVERY_IMAGE = ("subpixels", "exposure_samples", "exposure_share", "start_deg")
+_TEST = ("test_steps", "steps_per_turn", "step_s")
+
+
+def clean_file(scenario: Scenario, stack: Stack) -> str:
+    """Return the name of the file in which a noise-free stack is kept."""
+    text = json.dumps(_depends_on(scenario, stack), sort_keys=True)
+    return f"{stack.kind}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npy"
+
+
+def clean_stack(
+    scenario: Scenario, stack: Stack, folder: Path, *, progress: Progress = silent, workers: int | None = None
+) -> NDArray[np.float32]:
+    """Return a noise-free stack (image, row, column), share of the open beam, as a read-only memory map.
+
+    It is computed, `workers` images side by side, and kept where the folder does not hold it.
+    """
+    path = folder / clean_file(scenario, stack)
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        # another process may be at the same stack: each writes its own file, and either may name it
+        partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+        try:
+            _compute(scenario, stack, partial, progress, workers or os.cpu_count() or 1)
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+    kept: NDArray[np.float32] = np.load(path, mmap_mode="r")
+    return kept
+
+
+def _compute(scenario: Scenario, stack: Stack, path: Path, progress: Progress, workers: int) -> None:
+    count = image_count(scenario, stack)
+    shape = count, scenario.geometry.rows, scenario.geometry.columns
+    images = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+    make = clear_images(prepare(scenario, course_of(scenario)), stack)
+    task = f"{stack} without noise"
+    progress(task, 0, count)
+    for index, image in in_order(make, range(count), workers):
+        images[index] = image
+        progress(task, index + 1, count)
+    images.flush()
+
+
+def _depends_on(scenario: Scenario, stack: Stack) -> dict[str, Any]:
+    parts, plan = {"seed", "specimen", "graphite", "geometry", "misalignment", "xray"}, set(_EVERY_IMAGE)
+    if stack.kind != "reference":
+        # motion refers to the height that the discarded rows leave
+        parts |= {"discarded_rows", "loading", "motion"}
+        plan |= set(_TEST)
+    spectrum = read_spectrum(scenario.xray.spectrum)
+    return {
+        "version": version("pdvc-bench"),
+        "stack": [stack.kind, stack.step, image_count(scenario, stack)],
+        # the name may be that of a file, whose content may change
+        "spectrum": [spectrum.energy_keV.tolist(), spectrum.fluence.tolist()],
+        "blur_px": scenario.detector.blur_px,
+        **scenario.model_dump(mode="json", include=parts),
+        "acquisition": scenario.acquisition.model_dump(mode="json", include=plan),
+    }
