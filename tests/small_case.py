@@ -7,7 +7,6 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from pdvc.equations import Images, linearise
 from pdvc.experiment import Series
@@ -16,7 +15,8 @@ from pdvc.history import Angle, Polynomial, time_basis
 from pdvc.projection import project
 from pdvc.rays import ray_vectors
 from pdvc.sections import SectionBasis
-from pdvc.volume import Grid, Hull, Volume, hull_of
+from pdvc.volume import Volume
+from validation.small_cases import placed_volume, textured_volume
 
 Floats = NDArray[np.float64]
 
@@ -38,31 +38,14 @@ STEPS = 24
 ANGLES = np.linspace(0.3, 0.3 + 4 * np.pi, STEPS, endpoint=False)
 
 
-def hull_around(values: NDArray[np.float32], grid: Grid) -> Hull:
-    """Return a hull with the margin that measurements use: three voxels."""
-    near = ndimage.binary_dilation(values != 0, np.ones((3, 3, 3)))
-    return hull_of(near, grid, 4).grown(3 * grid.voxel_mm)
-
-
 def volume_of(values: NDArray[np.float32], voxel_mm: float = VOXEL_MM) -> Volume:
     """Place an array (z, y, x) with its middle a little off the axis."""
-    nz, ny, nx = values.shape
-    origin = tuple(float(-(n - 1) / 2 * voxel_mm + off) for n, off in ((nx, 0.02), (ny, -0.03), (nz, 0.01)))
-    grid = Grid(shape=(nz, ny, nx), voxel_mm=voxel_mm, origin_mm=origin)  # type: ignore[arg-type]
-    return Volume(values=values, grid=grid, hull=hull_around(values, grid))
+    return placed_volume(values, voxel_mm)
 
 
-@cache
 def textured(blur: float = 1.2) -> Volume:
     """Return an elliptical bar of 22 x 16 x 56 voxels full of texture, with soft edges, in a grid with air around."""
-    shape = (64, 24, 30)
-    rng = np.random.default_rng(20180704)
-    z, y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in shape), indexing="ij")
-    bar = (((x / 11) ** 2 + (y / 8) ** 2 < 1) & (np.abs(z) < 28)).astype(float)
-    grain = ndimage.gaussian_filter(rng.normal(size=shape), blur)
-    body = ndimage.gaussian_filter(bar * (1 + 0.35 * grain / grain.std()), 0.6, truncate=3)
-    values = np.where(body > 1e-3, body, 0).astype(np.float32)
-    return volume_of(values)
+    return textured_volume((64, 24, 30), VOXEL_MM, blur_voxel=blur, seed=20180704)
 
 
 def rays_at(angle_rad: float, scanner: ConeBeam = SCANNER) -> Floats:

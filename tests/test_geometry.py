@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pdvc.geometry import ConeBeam
 from pdvc.rays import directions, ray_vectors
-from tests.strategies import angles_rad, cone_beams
+from validation.strategies import angles_rad, cone_beams
 
 SCANNER = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=60, columns=44)
 
@@ -53,7 +53,7 @@ def test_shifts_move_the_detector_right_and_down_and_roll_turns_columns_towards_
     np.testing.assert_allclose(rays.row_mm[0], [0, 0.25, -0.5 * np.sqrt(0.75)], atol=1e-12)
 
 
-@given(angles_rad)
+@given(angles_rad())
 def test_beam_column_and_row_are_right_handed_unit_vectors(angle):
     beam, column = (vector[0] for vector in directions(angle))
     np.testing.assert_allclose(np.cross(beam, column), [0, 0, -1], atol=1e-12)
@@ -61,7 +61,7 @@ def test_beam_column_and_row_are_right_handed_unit_vectors(angle):
 
 
 @settings(deadline=None)
-@given(cone_beams(), angles_rad, st.data())
+@given(cone_beams(), angles_rad(), st.data())
 def test_a_cropped_window_looks_along_the_same_rays(geometry, angle, data):
     row_from = data.draw(st.integers(0, geometry.rows - 1))
     row_to = data.draw(st.integers(row_from + 1, geometry.rows))
@@ -77,7 +77,7 @@ def test_a_cropped_window_looks_along_the_same_rays(geometry, angle, data):
 
 
 @settings(deadline=None)
-@given(cone_beams(), angles_rad, st.integers(1, 7))
+@given(cone_beams(), angles_rad(), st.integers(1, 7))
 def test_a_binned_pixel_stands_at_the_mean_of_its_block_whatever_is_left_over(geometry, angle, factor):
     coarse = geometry.binned(factor)
     expected = block_means(centres(geometry, angle), factor)

@@ -20,7 +20,7 @@ from simulator.ingredients import (
 from simulator.kinematics import BeamMotion, Composition, MotionError, RigidMotion, SectionMotion, rotation_matrix
 from simulator.loading import Loading, load_history
 from simulator.specimen import Specimen, area_mm2
-from tests.strategies import beam_motions, motions, rigid_motions, section_motions
+from validation.strategies import beam_motions, motions, rigid_motions, section_motions
 
 FEW = settings(max_examples=40, deadline=None)
 ANGLE = 2 * np.pi * np.arange(127) / 50
@@ -38,7 +38,7 @@ def paper_motion(**changes):
 
 
 @FEW
-@given(motions, st.integers(0, 100))
+@given(motions(), st.integers(0, 100))
 def test_inverse_undoes_forward(motion, seed):
     points = material_points(seed)
     np.testing.assert_allclose(motion.inverse(motion.forward(points, 0), 0), points, atol=1e-10)

@@ -22,7 +22,6 @@ from tests.small_case import (
     SECTIONS,
     SHAPE,
     VOXEL_MM,
-    hull_around,
     motion,
     plane_sums,
     rays_at,
@@ -30,6 +29,7 @@ from tests.small_case import (
     textured,
     volume_of,
 )
+from validation.small_cases import hull_around
 
 BLANK = np.zeros(SHAPE, dtype=np.float32)
 EVEN = np.ones(SHAPE, dtype=np.float32)

@@ -21,7 +21,7 @@ from pdvc.radiographs import (
     snr_db,
 )
 from pdvc.rays import ray_vectors
-from tests.strategies import cone_beams
+from validation.strategies import cone_beams
 
 ROWS, COLUMNS = 31, 22
 BAD = [(0, 0), (5, 7), (5, 8), (20, 21), (30, 3)]

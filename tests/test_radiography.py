@@ -19,7 +19,7 @@ from simulator import radiography
 from simulator.microstructure import Graphite, place
 from simulator.radiography import Body, path_lengths
 from simulator.specimen import Specimen, dog_bone, section_mm, turn_back
-from tests.strategies import angles_rad, cone_beams
+from validation.strategies import angles_rad, cone_beams
 
 SCANNER = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=60, columns=44)
 PARALLEL = ConeBeam(source_axis_mm=1e6, source_detector_mm=1.0001e6, pixel_mm=0.02, rows=170, columns=150)
@@ -79,7 +79,7 @@ points = st.lists(st.floats(-0.8, 0.8), min_size=3, max_size=3).map(np.array)
 
 
 @settings(deadline=None)
-@given(cone_beams(), angles_rad, points, shapes, st.integers(1, 3))
+@given(cone_beams(), angles_rad(), points, shapes, st.integers(1, 3))
 def test_nodule_chords_are_those_of_the_ellipsoid(geometry, angle_rad, centre, shape, subpixels):
     matrix, graphite = path_lengths(body(None, [centre], [shape]), geometry, angle_rad, subpixels)
     expected = chords_of_ellipsoid(centre, shape, *rays_in_sample_frame(geometry, angle_rad, subpixels))
@@ -100,7 +100,7 @@ def test_small_nodules_are_exact_far_from_the_axis():
 
 
 @settings(deadline=None)
-@given(cone_beams(), angles_rad, st.integers(1, 3))
+@given(cone_beams(), angles_rad(), st.integers(1, 3))
 def test_surface_chords_are_those_of_the_box(geometry, angle_rad, subpixels):
     half = np.array([0.7, 0.4, 0.5])
     mesh = trimesh.creation.box(2 * half).subdivide().subdivide()
@@ -151,7 +151,7 @@ def test_chords_through_a_deformed_dog_bone_agree_with_quadrature():
 
 
 @settings(max_examples=30, deadline=None)
-@given(cone_beams(), angles_rad, st.integers(0, 2**32 - 1), st.booleans())
+@given(cone_beams(), angles_rad(), st.integers(0, 2**32 - 1), st.booleans())
 def test_no_ray_leaks(geometry, angle_rad, seed, aligned):
     """The signed crossings of every ray sum to exactly zero, for crumpled surfaces and for aligned edges."""
     rng = np.random.default_rng(seed)
@@ -179,7 +179,7 @@ def test_no_ray_leaks_through_the_dog_bone_at_full_size():
 
 
 @settings(max_examples=15, deadline=None)
-@given(angles_rad, st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), points)
+@given(angles_rad(), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), points)
 def test_rigid_motion_conserves_the_amount_of_matter(angle_rad, tilt, lean, centre):
     """A far source sees volume / pixel area as the sum of all path lengths, wherever the object is."""
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
@@ -229,7 +229,7 @@ def test_a_shifted_detector_moves_the_image_the_other_way_and_roll_turns_it():
     np.testing.assert_allclose((row, column), (-10 * math.sin(0.3), 10 * math.cos(0.3)), atol=0.02)
 
 
-@given(cone_beams(), angles_rad, st.integers(2, 4))
+@given(cone_beams(), angles_rad(), st.integers(2, 4))
 @settings(max_examples=20, deadline=None)
 def test_cropping_the_geometry_crops_the_image(geometry, angle_rad, factor):
     sample = body(trimesh.creation.icosphere(subdivisions=2, radius=0.8), [[0.2, 0.1, -0.3]], [0.3 * np.eye(3)])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
-from tests.strategies import section_bases
+from validation.strategies import section_bases
 
 NUMBERS = st.floats(-10.0, 10.0)
 POINTS = arrays(float, (7, 3), elements=NUMBERS)

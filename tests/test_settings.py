@@ -7,7 +7,7 @@ from pdvc.experiment import Description
 from pdvc.history import Angle, Force, Polynomial, Ramp, Splines
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.settings import SettingsError, read_toml
-from tests.strategies import descriptions
+from validation.strategies import descriptions
 
 VALID = {
     "geometry": {"source_axis_mm": 30.0, "source_detector_mm": 300.0, "pixel_mm": 0.5, "rows": 6, "columns": 4},
