@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +14,8 @@ from pdvc.beam_hardening import Outline, find_outline
 from pdvc.equations import Images
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
-from pdvc.options import MeasureOptions
-from pdvc.progress import Progress
+from pdvc.options import MeasureOptions, resolved
+from pdvc.progress import Progress, silent
 from pdvc.projection import project_at_rest
 from pdvc.radiographs import Calibration, binned, calibrate, coarsened, fill, grey_levels, grey_variance, snr_db
 from pdvc.rays import ray_vectors
@@ -75,7 +77,7 @@ def calibrated(
             "polynomial": np.array(outline.polynomial),
         }
 
-    kept = store.arrays(f"outline {options.beam_hardening}", found)
+    kept = store.arrays(f"outline {options.beam_hardening}", found, reference_alone=True)
     z_mm, slab_mm = kept["place_mm"]
     c1, c2, c3 = (float(c) for c in kept["polynomial"])
     outline = Outline(
@@ -129,6 +131,29 @@ def prepare(
     )
 
 
+def keep_volumes(
+    experiment: Experiment, options: MeasureOptions, folder: Path, *, progress: Progress = silent
+) -> None:
+    """Make what a measurement takes from the reference scan alone, outline and volumes, and keep it in a folder.
+
+    Every measurement that works in this folder (`measure(..., work=folder)`), of an experiment with the same
+    reference scan, finds it there: see `volume_choices`.
+    """
+    store = Store(folder, experiment)
+    calibration, outline = calibrated(experiment, options, store, progress)
+    scales, beam_hardening = volume_choices(resolved(options, experiment.geometry))
+    for scale in scales:
+        view = _viewer(experiment.reference, calibration, scale)
+        name = f"scale {scale} {beam_hardening}"
+        _volume(experiment, experiment.geometry.binned(scale), outline, view, name, store, progress)
+
+
+def volume_choices(options: MeasureOptions) -> tuple[tuple[int, ...], Any]:
+    """Return the options on which volumes depend, of resolved ones: scales, coarsest first, and beam hardening."""
+    scales = {stage.scale for stage in (*options.rigid, *options.deformation) if isinstance(stage.scale, int)}
+    return tuple(sorted(scales, reverse=True)), options.beam_hardening
+
+
 def _viewer(series: Series, calibration: Calibration, scale: int) -> Callable[[int], Image]:
     def view(i: int) -> Image:
         return coarsened(grey_levels(series.counts[i], calibration), scale)
@@ -159,7 +184,7 @@ def _volume(
         task = f"reconstruct {geometry.voxel_mm * 1e3:.1f} um"
         return {"F": fdk(view, geometry, experiment.reference.angle_rad, grid, hull, progress=progress, task=task)}
 
-    values = store.arrays(f"volume {name}", reconstructed)["F"]
+    values = store.arrays(f"volume {name}", reconstructed, reference_alone=True)["F"]
     return Volume(values=values, grid=grid, hull=hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm))
 
 

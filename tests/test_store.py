@@ -69,6 +69,16 @@ def test_another_name_or_experiment_is_made_anew(tmp_path, name, other):
     assert make.calls == 2
 
 
+def test_what_depends_on_the_reference_scan_alone_is_found_by_another_test_of_the_same_sample(tmp_path):
+    make = Maker()
+    one, two = experiment(), replace(experiment(), test=experiment(force_N=2.0).test)
+    for each in (one, two):
+        Store(tmp_path, each).arrays("volume a", make, reference_alone=True)
+    assert make.calls == 1
+    Store(tmp_path, replace(one, reference=two.test)).arrays("volume a", make, reference_alone=True)
+    assert make.calls == 2
+
+
 def test_without_a_folder_nothing_is_kept():
     make = Maker()
     store = Store(None, experiment())

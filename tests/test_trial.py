@@ -1,0 +1,91 @@
+"""One trial: what identifies it, what it shares, and that sharing changes nothing."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from pdvc.options import MeasureOptions, StageOptions
+from simulator.scenario import Scenario
+from tests.test_job import TINY
+from validation import trial as room
+from validation.trial import Trial, Volumes, clean_parts, score_columns
+
+FAST = {"rigid": (StageOptions(scale="coarse", most=2),), "deformation": (StageOptions(scale=1, most=2),)}
+
+
+def trial(options=None, **changes):
+    values = tomllib.loads(TINY)
+    for key, value in changes.items():
+        values[key] = {**values[key], **value} if isinstance(values.get(key), dict) else value
+    scenario = Scenario.parse(values, where="trial")
+    return Trial(scenario=scenario, options=MeasureOptions(**FAST, **(options or {})), factors={})
+
+
+def without_times(scores):
+    return {name: value for name, value in scores.items() if not name.startswith("seconds")}
+
+
+def test_sharing_changes_nothing(tmp_path):
+    other = trial({"sections": 4}, acquisition={"steps_per_turn": 11})
+    for part in (*clean_parts(other.scenario), Volumes(other.scenario, other.options)):
+        part.make(tmp_path / "shared")
+    one = trial({"sections": 5})
+    kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "shared").rglob("*.np?")}
+    shared, alone = one.carry_out(tmp_path / "shared"), one.carry_out(tmp_path / "alone")
+    assert without_times(shared.scores) == without_times(alone.scores)
+    for name in ("points", "strain"):
+        np.testing.assert_array_equal(shared.arrays[name], alone.arrays[name])
+    now = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "shared").rglob("*.np?")}
+    # reference stack, outline and volumes were found; only the test's radiographs and its modes are new
+    assert {name: now[name] for name in kept} == kept
+    assert {name.split("-")[0] for name in now.keys() - kept.keys()} == {"test", "stage"}
+    assert not list((tmp_path / "shared").glob("experiment-*"))
+    self_consistent(shared)
+
+
+def self_consistent(result):
+    assert set(result.scores) == set(score_columns())
+    for name, kind in score_columns().items():
+        assert isinstance(result.scores[name], kind), name
+    rms = np.sqrt(np.nanmean(result.arrays["points"].astype(float) ** 2, axis=(0, 1)))
+    for value, name in zip(rms, ("across_beam", "vertical", "along_beam"), strict=True):
+        # the scores take all heights, the arrays those about a section apart
+        assert value == pytest.approx(result.scores[f"error_voxel_{name}"], rel=0.2)
+    strain = np.sqrt(np.nanmean(result.arrays["strain"].astype(float) ** 2))
+    assert strain == pytest.approx(result.scores["strain_rms"], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("other", "same_key", "same_volumes"),
+    [
+        (trial(name="other", title="other"), True, True),
+        (trial({"sections": 5}), False, True),
+        (trial(motion={"ingredients": []}), False, True),
+        (trial(repetition=1), False, False),
+        (trial(detector={"frames": 2}), False, False),
+        (trial(acquisition={"reference_views": 61}), False, False),
+        (trial({"beam_hardening": "none"}), False, False),
+    ],
+)
+def test_keys_and_shared_volumes(other, same_key, same_volumes):
+    assert (trial().key == other.key) == same_key
+    volumes = [Volumes(each.scenario, each.options).name for each in (trial(), other)]
+    assert (volumes[0] == volumes[1]) == same_volumes
+
+
+def test_the_factors_are_no_part_of_the_key():
+    assert replace(trial(), factors={"noise": 1.0}).key == trial().key
+
+
+def test_a_score_that_fits_no_column_is_named(monkeypatch):
+    @dataclass
+    class Odd:
+        spread: tuple
+
+    monkeypatch.setattr(room, "Scores", Odd)
+    with pytest.raises(TypeError, match=r"Scores\.spread: expected a number"):
+        score_columns()

@@ -1,0 +1,336 @@
+"""Many runs on dask.distributed, each on disk as soon as it is finished, in one folder that can be resumed.
+
+DIR/runs/KEY.parquet     one row for each finished run; the folder reads as one table
+DIR/errors/KEY.npz       its arrays
+DIR/failed/KEY.log       the traceback of a run that failed
+DIR/table.parquet        at the end: all rows, in the order of the runs
+DIR/work/                what runs share, while they need it; removed at the end
+
+A run is anything with a key, columns that say which it is, and a way to be carried out (`Run`). What several runs
+share is a `Part`: a dask task of its own on which they depend, made once, and removed as soon as no run needs it any
+more. The parts in use, and so the disk space, are bounded: few more runs are handed out than there are workers.
+
+A run whose worker dies is started again by dask. One that goes on killing its workers is tried by itself at the end,
+and then given up. A run that raises becomes a row with its reason. Called again, runs that are done are not repeated;
+those that failed are.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import shutil
+import time
+import traceback
+import uuid
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import parquet
+
+from pdvc.progress import Progress, silent
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from distributed import Client, Future
+
+Scalar = str | int | float | bool | None
+
+RUNS, ERRORS, FAILED, WORK, TABLE = "runs", "errors", "failed", "work", "table.parquet"
+ANSWER_S = 10.0
+"""How long to wait for a scheduler to answer, s."""
+DEATHS_ALLOWED = 2
+"""Workers that a run may lose before it is set aside."""
+_TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
+
+
+class Part(Protocol):
+    """Be shared by several runs."""
+
+    @property
+    def name(self) -> str:
+        """Return its file or folder in the shared folder, a name that holds all it depends on."""
+
+    def needs(self) -> tuple[Part, ...]:
+        """Return the parts it is made from."""
+
+    def make(self, shared: Path) -> None:
+        """Make it, unless it is there; whole or not at all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """Hold what a run found."""
+
+    scores: Mapping[str, Scalar]
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+
+class Run(Protocol):
+    """Be carried out once, anywhere."""
+
+    @property
+    def key(self) -> str:
+        """Return a name for files, of all that the result depends on."""
+
+    @property
+    def columns(self) -> Mapping[str, Scalar]:
+        """Return what says which run this is: the first columns of its row. The types are those of all runs."""
+
+    @property
+    def score_columns(self) -> Mapping[str, type]:
+        """Return names and types of the scores."""
+
+    def parts(self) -> tuple[Part, ...]:
+        """Return the parts it uses; it makes those that it does not find."""
+
+    def carry_out(self, shared: Path) -> Result:
+        """Do it; what it raises is the reason in its row."""
+
+
+def run_trials(
+    trials: Sequence[Run],
+    folder: Path,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    progress: Progress = silent,
+) -> pd.DataFrame:
+    """Carry out all runs that the folder does not hold yet; return the table of all, in their order.
+
+    Runs go to the Dask scheduler at an address, whose workers see the folder under the same path, or else to `workers`
+    local processes, by default one for each processor. The table depends on neither, but for columns whose name
+    begins with ``seconds``. Raises ValueError where the scheduler does not answer.
+    """
+    shared = (folder / WORK).resolve()
+    waiting = {run.key: run for run in trials if not is_done(folder, run)}
+    total = len({run.key for run in trials})
+    if waiting:
+        for name in (RUNS, ERRORS, FAILED):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        for left in shared.glob("experiment-*"):  # by runs that were killed
+            shutil.rmtree(left, ignore_errors=True)
+        with connected(scheduler, workers, shared) as client:
+            _Session(client, folder.resolve(), shared, total, progress).carry_out(list(waiting.values()))
+    shutil.rmtree(shared, ignore_errors=True)
+    table = collected(trials, folder)
+    partial = folder / f"{TABLE}.partial"
+    parquet.write_table(table, partial)
+    partial.replace(folder / TABLE)
+    return table.to_pandas()
+
+
+def is_done(folder: Path, run: Run) -> bool:
+    """Return whether a folder holds the row of a run that did not fail."""
+    path = folder / RUNS / f"{run.key}.parquet"
+    return path.exists() and parquet.read_table(path, columns=["status"])["status"][0].as_py() == "done"
+
+
+def collected(trials: Sequence[Run], folder: Path) -> pa.Table:
+    """Return the rows of finished runs, in the order of the runs."""
+    rows = []
+    for run in trials:
+        found = parquet.read_table(folder / RUNS / f"{run.key}.parquet")
+        # the row may have been written by a study that called its factors otherwise
+        rows.append(_row(run, {name: found[name][0].as_py() for name in found.column_names}))
+    return pa.concat_tables(rows, promote_options="permissive")
+
+
+@contextmanager
+def connected(scheduler: str | None, workers: int | None, scratch: Path) -> Iterator[Client]:
+    """Connect to a scheduler, or start a cluster of single-threaded processes here for as long as it is needed."""
+    import dask
+    from distributed import Client, LocalCluster
+    from distributed.system import MEMORY_LIMIT
+
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=ANSWER_S)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"--scheduler {scheduler}: expected the address of a Dask scheduler: {error}") from None
+        with client:
+            yield client
+        return
+    count = workers or os.cpu_count() or 1
+    one_thread = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": DEATHS_ALLOWED}),
+        LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=MEMORY_LIMIT // count,
+            env=one_thread,
+            dashboard_address=None,
+            local_directory=str(scratch),
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+class _Session:
+    """Hand out runs and the parts they share, and keep account of both."""
+
+    def __init__(self, client: Client, folder: Path, shared: Path, total: int, progress: Progress) -> None:
+        self._client, self._folder, self._shared = client, folder, shared
+        self._total, self._progress = total, progress
+        self._uses: Counter[str] = Counter()
+        self._parts: dict[str, Future] = {}
+        self._failed = 0
+        self._left = 0
+
+    def carry_out(self, runs: list[Run]) -> None:
+        from distributed import KilledWorker
+
+        for run in runs:
+            self._uses.update(part.name for part in _all_parts(run.parts()))
+        self._left = len(runs)
+        self._tell()
+        aside: list[Run] = []
+        for run, future in self._finished(runs, self._window):
+            if future.status == "error" and isinstance(future.exception(), KilledWorker):
+                aside.append(run)
+            else:
+                self._take(run, future)
+        for run, future in self._finished(aside, lambda: 1):
+            self._take(run, future)
+
+    def _finished(self, runs: list[Run], window: Any) -> Iterator[tuple[Run, Future]]:
+        """Submit runs, as many at a time as the window allows, and yield each when it is finished."""
+        from distributed import as_completed
+
+        waiting, finished = deque(enumerate(runs)), as_completed()
+        submitted: dict[Future, Run] = {}
+        while waiting or submitted:
+            while waiting and len(submitted) < window():
+                place, run = waiting.popleft()
+                future = self._submit(run, place)
+                submitted[future] = run
+                finished.add(future)
+            future = next(finished)
+            yield submitted.pop(future), future
+
+    def _window(self) -> int:
+        # one run more for each worker than it is busy with, so that it never waits
+        return max(2 * sum(self._client.nthreads().values()), 4)
+
+    def _submit(self, run: Run, place: int) -> Future:
+        parts = [self._part(part, place) for part in run.parts() if self._uses[part.name] > 1]
+        # not the run's own key: dask would answer a second attempt with the first one's failure
+        key = f"run-{uuid.uuid4().hex}"
+        return self._client.submit(
+            _carry_out, run, self._folder, self._shared, parts, key=key, priority=-place, pure=False
+        )
+
+    def _part(self, part: Part, place: int) -> Future:
+        if part.name not in self._parts or self._parts[part.name].status == "error":
+            needed = [self._part(each, place) for each in part.needs()]
+            self._parts[part.name] = self._client.submit(
+                _make, part, self._shared, needed, key=f"part-{uuid.uuid4().hex}", priority=-place, pure=False
+            )
+        return self._parts[part.name]
+
+    def _take(self, run: Run, future: Future) -> None:
+        if future.status == "finished":
+            done = future.result()
+        elif future.status == "error":  # no worker could say so
+            done = False
+            error = future.exception()
+            _write_failure(run, self._folder, error, "".join(traceback.format_exception(error)), 0.0)
+        else:
+            raise OSError(f"the scheduler gave up run {run.key} ({future.status}): it was lost or restarted")
+        self._failed += not done
+        self._left -= 1
+        self._tell()
+        for part in _all_parts(run.parts()):
+            self._uses[part.name] -= 1
+            if not self._uses[part.name]:
+                self._parts.pop(part.name, None)
+                _remove(self._shared / part.name)
+
+    def _tell(self) -> None:
+        task = f"runs, {self._failed} failed" if self._failed else "runs"
+        self._progress(task, self._total - self._left, self._total)
+
+
+def _all_parts(parts: tuple[Part, ...]) -> tuple[Part, ...]:
+    """Return parts and those that they need, each once."""
+    found = {part.name: part for part in parts}
+    for part in parts:
+        found.update({each.name: each for each in _all_parts(part.needs())})
+    return tuple(found.values())
+
+
+def _make(part: Part, shared: Path, needed: list[None]) -> None:
+    """Make a part on a worker; where that fails, the runs that need it try by themselves and have a row to say so."""
+    with suppress(Exception):
+        part.make(shared)
+
+
+def _carry_out(run: Run, folder: Path, shared: Path, parts: list[None]) -> bool:
+    """Carry out a run on a worker and write its row; returns whether it succeeded."""
+    import numba
+
+    if is_done(folder, run):  # and its worker died before it could say so
+        return True
+    numba.set_num_threads(1)
+    started = time.perf_counter()
+    try:
+        result = run.carry_out(shared)
+    except Exception as error:  # whatever it is, it is this row's reason
+        _write_failure(run, folder, error, traceback.format_exc(), time.perf_counter() - started)
+        return False
+    if result.arrays:
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **result.arrays)
+        _write_whole(folder / ERRORS / f"{run.key}.npz", buffer.getvalue())
+    values = {"status": "done", "reason": "", **result.scores, "seconds": time.perf_counter() - started}
+    _write_row(run, folder, values)
+    (folder / FAILED / f"{run.key}.log").unlink(missing_ok=True)
+    return True
+
+
+def _write_failure(run: Run, folder: Path, error: BaseException | None, trace: str, seconds: float) -> None:
+    _write_whole(folder / FAILED / f"{run.key}.log", trace.encode())
+    reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    _write_row(run, folder, {"status": "failed", "reason": reason, "seconds": seconds})
+
+
+def _write_row(run: Run, folder: Path, values: Mapping[str, Scalar]) -> None:
+    buffer = io.BytesIO()
+    parquet.write_table(_row(run, {**values, "version": version("pdvc-bench")}), buffer)
+    _write_whole(folder / RUNS / f"{run.key}.parquet", buffer.getvalue())
+
+
+def _row(run: Run, values: Mapping[str, Scalar]) -> pa.Table:
+    """Return the one row of a run: what is not among the values is null."""
+    kinds: dict[str, type] = {name: type(value) for name, value in run.columns.items()}
+    kinds |= {"status": str, "reason": str, **run.score_columns, "seconds": float, "version": str, "key": str}
+    values = {**values, **run.columns, "key": run.key}
+    columns = {name: pa.array([values.get(name)], type=_TYPES[kind]) for name, kind in kinds.items()}
+    return pa.table(columns)
+
+
+def _write_whole(path: Path, content: bytes) -> None:
+    # a name that begins with a dot is no part of the table that the folder is
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.write_bytes(content)
+    partial.replace(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
