@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import os
 import shutil
 import time
@@ -26,6 +27,7 @@ import traceback
 import uuid
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -115,7 +117,7 @@ def run_trials(
     waiting = {run.key: run for run in trials if not is_done(folder, run)}
     total = len({run.key for run in trials})
     if waiting:
-        for name in (RUNS, ERRORS, FAILED):
+        for name in (RUNS, ERRORS, FAILED, WORK):
             (folder / name).mkdir(parents=True, exist_ok=True)
         for left in shared.glob("experiment-*"):  # by runs that were killed
             shutil.rmtree(left, ignore_errors=True)
@@ -187,6 +189,7 @@ class _Session:
         self._total, self._progress = total, progress
         self._uses: Counter[str] = Counter()
         self._parts: dict[str, Future] = {}
+        self._made: set[str] = set()
         self._failed = 0
         self._left = 0
 
@@ -226,37 +229,47 @@ class _Session:
         return max(2 * sum(self._client.nthreads().values()), 4)
 
     def _submit(self, run: Run, place: int) -> Future:
-        parts = [self._part(part, place) for part in run.parts() if self._uses[part.name] > 1]
+        parts = self._parts_in_work(run.parts(), place)
         # not the run's own key: dask would answer a second attempt with the first one's failure
         key = f"run-{uuid.uuid4().hex}"
         return self._client.submit(
             _carry_out, run, self._folder, self._shared, parts, key=key, priority=-place, pure=False
         )
 
-    def _part(self, part: Part, place: int) -> Future:
-        if part.name not in self._parts or self._parts[part.name].status == "error":
-            needed = [self._part(each, place) for each in part.needs()]
-            self._parts[part.name] = self._client.submit(
-                _make, part, self._shared, needed, key=f"part-{uuid.uuid4().hex}", priority=-place, pure=False
-            )
-        return self._parts[part.name]
+    def _parts_in_work(self, parts: tuple[Part, ...], place: int) -> list[Future]:
+        """Return the futures of those parts that several runs share and that are not made yet."""
+        shared = [part for part in parts if self._uses[part.name] > 1 and part.name not in self._made]
+        for part in shared:
+            if part.name not in self._parts or self._parts[part.name].status == "error":
+                needed = self._parts_in_work(part.needs(), place)
+                self._parts[part.name] = self._client.submit(
+                    _make, part, self._shared, needed, key=f"part-{uuid.uuid4().hex}", priority=-place, pure=False
+                )
+        return [self._parts[part.name] for part in shared]
 
     def _take(self, run: Run, future: Future) -> None:
-        if future.status == "finished":
+        """Take note of a run that is finished, or write its row where no worker could."""
+        try:
+            # waits where the worker has died since, for another to find the row on disk
             done = future.result()
-        elif future.status == "error":  # no worker could say so
-            done = False
-            error = future.exception()
-            _write_failure(run, self._folder, error, "".join(traceback.format_exception(error)), 0.0)
-        else:
-            raise OSError(f"the scheduler gave up run {run.key} ({future.status}): it was lost or restarted")
+        except CancelledError:
+            raise OSError(f"the scheduler gave up run {run.key}: it was restarted, or its cluster closed") from None
+        except Exception as error:
+            done = is_done(self._folder, run)
+            if not done:
+                trace = "".join(traceback.format_exception(error))
+                _write_failure(run, self._folder, error, trace, math.nan)
+        # a future kept longer would be computed anew, with its parts, when the worker that holds its result dies
+        future.release()
         self._failed += not done
         self._left -= 1
         self._tell()
         for part in _all_parts(run.parts()):
+            # it is on disk now
+            self._made.add(part.name)
+            self._parts.pop(part.name, None)
             self._uses[part.name] -= 1
             if not self._uses[part.name]:
-                self._parts.pop(part.name, None)
                 _remove(self._shared / part.name)
 
     def _tell(self) -> None:
@@ -301,7 +314,7 @@ def _carry_out(run: Run, folder: Path, shared: Path, parts: list[None]) -> bool:
     return True
 
 
-def _write_failure(run: Run, folder: Path, error: BaseException | None, trace: str, seconds: float) -> None:
+def _write_failure(run: Run, folder: Path, error: Exception, trace: str, seconds: float) -> None:
     _write_whole(folder / FAILED / f"{run.key}.log", trace.encode())
     reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
     _write_row(run, folder, {"status": "failed", "reason": reason, "seconds": seconds})
