@@ -104,11 +104,11 @@ def _inside(
     inside = ndimage.binary_fill_holes(values > 0.5 * _sample_level(values))
     labels, count = ndimage.label(inside)
     if count == 0:
-        raise ValueError("reference radiographs: expected a sample, found only air")
+        raise ValueError("radiographs of a full scan: expected a sample, found only air")
     sizes = np.bincount(labels.ravel())[1:]
     if sizes.max() < 0.5 * sizes.sum():
         raise ValueError(
-            "reference radiographs: expected a sample, found only air: "
+            "radiographs of a full scan: expected a sample, found only air: "
             f"{count} scattered parts, the largest with {sizes.max() / sizes.sum():.0%} of their volume"
         )
     return np.asarray(labels == 1 + int(sizes.argmax()))

@@ -16,6 +16,7 @@ from pdvc.reconstruction import fdk
 from pdvc.sections import SectionBasis
 from pdvc.systematic import Systematic
 from pdvc.volume import Grid, Volume, hull_of
+from pdvc.volume_equations import VolumePair, compare
 
 TASK = "load or compile kernels"
 
@@ -40,3 +41,13 @@ def compile_kernels(*, progress: Progress = silent) -> None:
     systematic = Systematic(fields=views[:1], first=first, second=first, share=np.zeros(1), corner=(0, 0), shape=shape)
     systematic.registered(slice(0, 1), rays, basis, still, 0.1)
     progress(TASK, 3, 3)
+
+
+def compile_comparison() -> None:
+    """Call the kernel of volume correlation once on a few voxels."""
+    grid = Grid(shape=(4, 3, 3), voxel_mm=1.0, origin_mm=(0.0, 0.0, 0.0))
+    used = np.ones(grid.shape, dtype=bool)
+    volume = Volume(values=np.zeros(grid.shape, dtype=np.float32), grid=grid, hull=hull_of(used, grid, 2))
+    basis = SectionBasis(height_mm=np.zeros(1), radius_mm=1.0)
+    pair = VolumePair(reference=volume, deformed=volume, used=used, voxel_mm=1.0)
+    compare(pair, basis, np.zeros(basis.shape))

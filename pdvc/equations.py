@@ -53,13 +53,13 @@ class Equations:
     chi2: Floats
     """Weighted sum of squared residuals of each step (step,)."""
     residual: Image
-    """rho (step, row, column), grey levels."""
+    """rho (step, row, column), grey levels; of volumes (step, z, y, x), grey levels per mm."""
     pixels: int
-    """Number of used pixels over all steps."""
+    """Number of used pixels, or voxels, over all steps."""
 
     @property
     def rms(self) -> float:
-        """Return the weighted rms residual, grey levels."""
+        """Return the weighted rms residual, in the unit of the residual."""
         return float(np.sqrt(self.chi2.sum() / self.pixels))
 
 

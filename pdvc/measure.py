@@ -21,18 +21,16 @@ from pdvc import gauss_newton, pgd
 from pdvc.compilation import compile_kernels
 from pdvc.equations import Equations, linearise, residuals
 from pdvc.experiment import Experiment
-from pdvc.geometry import ConeBeam
 from pdvc.history import time_basis
 from pdvc.measurement import Measurement, Stage
 from pdvc.options import MeasureOptions, StageOptions, resolved
-from pdvc.preparation import Prepared, calibrated, prepare, snr_of, used_window
+from pdvc.preparation import Prepared, bases, calibrated, prepare, snr_of, used_window
 from pdvc.prior import Prior
 from pdvc.progress import Progress, silent
-from pdvc.sections import RIGID, SectionBasis
+from pdvc.sections import SectionBasis
 from pdvc.solution import Solution
 from pdvc.store import Store
 from pdvc.uncertainty import posterior
-from pdvc.volume import Hull
 
 __all__ = ["MeasureOptions", "StageOptions", "measure"]
 
@@ -55,7 +53,7 @@ def measure(
     store = Store(work, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)
     time_functions = time_basis(options.time, experiment.test)
-    rigid, sections = _bases(experiment.geometry, window, outline.hull, options)
+    rigid, sections = bases(experiment.geometry, window, outline.hull, options)
     scales = {_scale(stage) for stage in (*options.rigid, *options.deformation)}
     prepared = {
         scale: prepare(experiment, calibration, outline, window, scale, options, store, progress)
@@ -106,27 +104,8 @@ def measure(
             "measure": ended - solving,
         },
         options=options.template(),
-        versions=_versions(),
+        versions=versions(),
     )
-
-
-def _bases(
-    geometry: ConeBeam, window: tuple[int, int, int, int], hull: Hull, options: MeasureOptions
-) -> tuple[SectionBasis, SectionBasis]:
-    """Return the rigid basis, one section, and the section basis, spread over the used height."""
-    low, high = hull.box_mm()
-    radius = float(np.hypot(*(high - low)[:2]) / 4)
-    top = _height_mm(geometry, window[0] - 0.5)
-    bottom = _height_mm(geometry, window[1] - 0.5)
-    heights = np.linspace(bottom, top, options.sections)
-    rigid = SectionBasis(height_mm=np.array([(top + bottom) / 2]), radius_mm=radius, motions=RIGID)
-    return rigid, SectionBasis(height_mm=heights, radius_mm=radius, motions=options.section_motions)
-
-
-def _height_mm(geometry: ConeBeam, row: float) -> float:
-    """Return the height at which the middle of a detector row looks through the axis, mm."""
-    down = (row - (geometry.rows - 1) / 2) * geometry.pixel_mm + geometry.row_shift_mm
-    return -down / geometry.magnification
 
 
 def _prior(basis: SectionBasis, options: MeasureOptions) -> Prior:
@@ -234,6 +213,7 @@ def _scale(stage: StageOptions) -> int:
     return stage.scale
 
 
-def _versions() -> str:
+def versions() -> str:
+    """Return the versions of this package and of the libraries that compute."""
     names = ("pdvc-bench", "numpy", "scipy", "numba")
     return ", ".join(f"{name} {version(name)}" for name in names) + f", Python {platform.python_version()}"

@@ -93,6 +93,11 @@ class MeasureOptions(Settings):
         return names
 
 
+def coarse_scale(geometry: ConeBeam) -> int:
+    """Return the largest power of two, up to 16, that leaves about a hundred rows."""
+    return max(scale for scale in (1, 2, 4, 8, 16) if scale == 1 or geometry.rows >= COARSE_ROWS * scale)
+
+
 def resolved(options: MeasureOptions, geometry: ConeBeam) -> MeasureOptions:
     """Return the options with everything filled in that depends on the detector.
 
@@ -105,7 +110,7 @@ def resolved(options: MeasureOptions, geometry: ConeBeam) -> MeasureOptions:
             f"discard_rows, discard_columns: expected to leave some of {geometry.rows} x {geometry.columns} px, "
             f"got {rows} and {columns} px on each side"
         )
-    coarse = max(scale for scale in (1, 2, 4, 8, 16) if scale == 1 or geometry.rows >= COARSE_ROWS * scale)
+    coarse = coarse_scale(geometry)
     stages = {
         name: tuple(
             stage.model_copy(update={"scale": coarse}) if stage.scale == "coarse" else stage

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,20 @@ from pdvc.geometry import ConeBeam
 from pdvc.options import MeasureOptions, resolved
 from pdvc.progress import Progress, silent
 from pdvc.projection import project_at_rest
-from pdvc.radiographs import Calibration, binned, calibrate, coarsened, fill, grey_levels, grey_variance, snr_db
+from pdvc.radiographs import (
+    IDENTITY,
+    Calibration,
+    binned,
+    calibrate,
+    coarsened,
+    fill,
+    grey_levels,
+    grey_variance,
+    snr_db,
+)
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import fdk, seen_half_height_mm
+from pdvc.sections import RIGID, SectionBasis
 from pdvc.store import Store
 from pdvc.systematic import Neighbours, Systematic, neighbouring_views
 from pdvc.volume import Grid, Hull, Volume
@@ -31,6 +43,9 @@ _OUTLINE_ROWS = 240
 """The outline is found on radiographs binned to about this many rows."""
 _OUTLINE_VIEWS = 150
 _HULL_MARGIN_VOXEL = 3.0
+
+Keep = Callable[[Callable[[], Mapping[str, NDArray[Any]]]], Mapping[str, NDArray[Any]]]
+"""Store.arrays with its name already given: makes arrays, or finds them kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,22 +69,30 @@ def calibrated(
 ) -> tuple[Calibration, Outline]:
     """Return the detector's calibration, with the beam-hardening polynomial, and the sample's outline."""
     calibration = calibrate(experiment)
-    geometry, reference = experiment.geometry, experiment.reference
+    given = {"fit": None, "none": IDENTITY}.get(str(options.beam_hardening), options.beam_hardening)
+    polynomial = given if isinstance(given, tuple) else None
+    keep = partial(store.arrays, f"outline {options.beam_hardening}", reference_alone=True)
+    outline = outlined(experiment.reference, experiment.geometry, calibration, polynomial, keep, progress)
+    return calibration.with_polynomial(outline.polynomial), outline
+
+
+def outlined(
+    series: Series,
+    geometry: ConeBeam,
+    calibration: Calibration,
+    polynomial: tuple[float, float, float] | None,
+    keep: Keep,
+    progress: Progress,
+) -> Outline:
+    """Return the sample's outline in a full scan; `calibration` without beam hardening, else as in `find_outline`."""
     factor = max(1, round(geometry.rows / _OUTLINE_ROWS))
-    chosen = np.unique(np.linspace(0, len(reference), min(_OUTLINE_VIEWS, len(reference)), endpoint=False).astype(int))
-    given = {"fit": None, "none": (1.0, 0.0, 0.0)}.get(str(options.beam_hardening), options.beam_hardening)
+    chosen = np.unique(np.linspace(0, len(series), min(_OUTLINE_VIEWS, len(series)), endpoint=False).astype(int))
 
     def view(i: int) -> Image:
-        return binned(grey_levels(reference.counts[chosen[i]], calibration), factor)
+        return binned(grey_levels(series.counts[chosen[i]], calibration), factor)
 
     def found() -> dict[str, Floats]:
-        outline = find_outline(
-            view,
-            geometry.binned(factor),
-            reference.angle_rad[chosen],
-            given if isinstance(given, tuple) else None,
-            progress=progress,
-        )
+        outline = find_outline(view, geometry.binned(factor), series.angle_rad[chosen], polynomial, progress=progress)
         hull = outline.hull
         return {
             "place_mm": np.array([hull.z_mm, hull.slab_mm]),
@@ -77,13 +100,31 @@ def calibrated(
             "polynomial": np.array(outline.polynomial),
         }
 
-    kept = store.arrays(f"outline {options.beam_hardening}", found, reference_alone=True)
+    kept = keep(found)
     z_mm, slab_mm = kept["place_mm"]
     c1, c2, c3 = (float(c) for c in kept["polynomial"])
-    outline = Outline(
+    return Outline(
         hull=Hull(z_mm=float(z_mm), slab_mm=float(slab_mm), support_mm=kept["support_mm"]), polynomial=(c1, c2, c3)
     )
-    return calibration.with_polynomial(outline.polynomial), outline
+
+
+def bases(
+    geometry: ConeBeam, window: tuple[int, int, int, int], hull: Hull, options: MeasureOptions
+) -> tuple[SectionBasis, SectionBasis]:
+    """Return the rigid basis, one section, and the section basis, spread over the used height."""
+    low, high = hull.box_mm()
+    radius = float(np.hypot(*(high - low)[:2]) / 4)
+    top = _height_mm(geometry, window[0] - 0.5)
+    bottom = _height_mm(geometry, window[1] - 0.5)
+    heights = np.linspace(bottom, top, options.sections)
+    rigid = SectionBasis(height_mm=np.array([(top + bottom) / 2]), radius_mm=radius, motions=RIGID)
+    return rigid, SectionBasis(height_mm=heights, radius_mm=radius, motions=options.section_motions)
+
+
+def _height_mm(geometry: ConeBeam, row: float) -> float:
+    """Return the height at which the middle of a detector row looks through the axis, mm."""
+    down = (row - (geometry.rows - 1) / 2) * geometry.pixel_mm + geometry.row_shift_mm
+    return -down / geometry.magnification
 
 
 def prepare(
@@ -101,7 +142,7 @@ def prepare(
     part = tuple(edge // scale for edge in window)
     used = geometry.cropped(*part)
     view = _viewer(experiment.reference, calibration, scale)
-    volume = _volume(experiment, geometry, outline, view, f"scale {scale} {options.beam_hardening}", store, progress)
+    volume = reference_volume(experiment, calibration, outline.hull, scale, options.beam_hardening, store, progress)
     systematic, snr_reprojection = _systematic(experiment, geometry, part, view, volume, progress)
     grey, variance = _test_radiographs(experiment, calibration, part, scale, progress)
     good = ~_coarse_bad(calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
@@ -143,9 +184,7 @@ def keep_volumes(
     calibration, outline = calibrated(experiment, options, store, progress)
     scales, beam_hardening = volume_choices(resolved(options, experiment.geometry))
     for scale in scales:
-        view = _viewer(experiment.reference, calibration, scale)
-        name = f"scale {scale} {beam_hardening}"
-        _volume(experiment, experiment.geometry.binned(scale), outline, view, name, store, progress)
+        reference_volume(experiment, calibration, outline.hull, scale, beam_hardening, store, progress)
 
 
 def volume_choices(options: MeasureOptions) -> tuple[tuple[int, ...], Any]:
@@ -161,19 +200,34 @@ def _viewer(series: Series, calibration: Calibration, scale: int) -> Callable[[i
     return view
 
 
-def _volume(
+def reference_volume(
     experiment: Experiment,
-    geometry: ConeBeam,
-    outline: Outline,
-    view: Callable[[int], Image],
-    name: str,
+    calibration: Calibration,
+    hull: Hull,
+    scale: int,
+    beam_hardening: Any,
     store: Store,
     progress: Progress,
 ) -> Volume:
-    low, high = outline.hull.box_mm()
+    """Reconstruct the reference scan at a scale; every experiment with the same reference scan finds it kept."""
+    keep = partial(store.arrays, f"volume scale {scale} {beam_hardening}", reference_alone=True)
+    return scan_volume(experiment.reference, experiment.geometry, calibration, hull, scale, keep, progress)
+
+
+def scan_volume(
+    series: Series,
+    geometry: ConeBeam,
+    calibration: Calibration,
+    hull: Hull,
+    scale: int,
+    keep: Keep,
+    progress: Progress,
+) -> Volume:
+    """Reconstruct a full scan at a scale, inside a hull; `geometry` is that of scale 1."""
+    view, geometry = _viewer(series, calibration, scale), geometry.binned(scale)
+    low, high = hull.box_mm()
     radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
     reach = seen_half_height_mm(geometry, radius)
-    hull = outline.hull
     # two voxels of air around the hull keep interpolation, and its gradient, inside the grid
     margin = np.full(3, 2 * geometry.voxel_mm)
     low, high = low - margin, high + margin
@@ -182,9 +236,9 @@ def _volume(
 
     def reconstructed() -> dict[str, NDArray[np.float32]]:
         task = f"reconstruct {geometry.voxel_mm * 1e3:.1f} um"
-        return {"F": fdk(view, geometry, experiment.reference.angle_rad, grid, hull, progress=progress, task=task)}
+        return {"F": fdk(view, geometry, series.angle_rad, grid, hull, progress=progress, task=task)}
 
-    values = store.arrays(f"volume {name}", reconstructed, reference_alone=True)["F"]
+    values = keep(reconstructed)["F"]
     return Volume(values=values, grid=grid, hull=hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm))
 
 

@@ -24,7 +24,7 @@ from scipy import fft, ndimage
 from pdvc.geometry import ConeBeam
 from pdvc.progress import Progress, silent
 from pdvc.rays import directions
-from pdvc.volume import Grid, Hull
+from pdvc.volume import Grid, Hull, framed
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -71,7 +71,7 @@ def fdk(
             first,
         )
         progress(task, batch.stop, len(angle_rad))
-    return _framed(np.ascontiguousarray(result.transpose(2, 0, 1)))
+    return framed(np.ascontiguousarray(result.transpose(2, 0, 1)))
 
 
 def angular_share(angle_rad: Floats) -> Floats:
@@ -84,8 +84,8 @@ def angular_share(angle_rad: Floats) -> Floats:
     gaps = np.diff(np.append(unique, unique[0] + 2 * np.pi))
     if len(unique) < 3 or gaps.max() > LARGEST_GAP_RAD:
         raise ValueError(
-            f"reference angles: expected a full turn without gaps above {np.rad2deg(LARGEST_GAP_RAD):.0f} degrees, "
-            f"found one of {np.rad2deg(gaps.max()):.1f} degrees"
+            "angles of a full scan: expected a full turn without gaps above "
+            f"{np.rad2deg(LARGEST_GAP_RAD):.0f} degrees, found one of {np.rad2deg(gaps.max()):.1f} degrees"
         )
     part = (gaps + np.roll(gaps, 1)) / 2 / count
     return np.asarray(part[inverse] / 2)
@@ -211,12 +211,3 @@ def _back_project(out, views, beam, across, origin, voxel, distances, shift, ins
                             np.float32(rows - 1.001),
                             weight,
                         )
-
-
-def _framed(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Set the outermost layer of voxels to zero, so that interpolation at the hull ends in air."""
-    for axis in range(3):
-        face = np.moveaxis(values, axis, 0)
-        face[0] = 0
-        face[-1] = 0
-    return values

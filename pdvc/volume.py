@@ -1,4 +1,4 @@
-"""The reference volume and its hull: where the sample is, so that no time is spent on air."""
+"""A reconstructed volume and its hull: where the sample is, so that no time is spent on air."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +102,7 @@ class Grid:
 
 @dataclass(frozen=True, kw_only=True)
 class Volume:
-    """Hold the attenuation F of the reference state in grey levels per mm, zero outside the hull."""
+    """Hold the attenuation F of one state, usually the reference, in grey levels per mm, zero outside the hull."""
 
     values: NDArray[np.float32]
     """(z, y, x), grey levels per mm; one layer of zeros on every face."""
@@ -114,3 +115,46 @@ class Volume:
             raise ValueError(
                 f"volume: expected float32 {self.grid.shape}, got {self.values.dtype} {self.values.shape}"
             )
+
+
+def framed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Set the outermost layer of voxels to zero, in place, so that interpolation at the hull ends in air."""
+    for axis in range(3):
+        face = np.moveaxis(values, axis, 0)
+        face[0] = 0
+        face[-1] = 0
+    return values
+
+
+def smoothed(volume: Volume, deviation_voxel: float) -> Volume:
+    """Return the volume after a Gaussian filter, its standard deviation in voxels of the volume."""
+    values = ndimage.gaussian_filter(_continued(volume.values), deviation_voxel, mode="nearest")
+    return Volume(values=framed(values), grid=volume.grid, hull=volume.hull)
+
+
+def halved(volume: Volume) -> Volume:
+    """Return the volume on a grid of half the voxel, between its voxels by cubic spline interpolation.
+
+    With c the spline's coefficients, the value midway between voxels i and i + 1 is
+    (c_i-1 + 23 c_i + 23 c_i+1 + c_i+2) / 48 (Unser, IEEE Signal Processing Magazine 16, 1999).
+    """
+    values = _continued(volume.values)
+    for axis in range(3):
+        known = np.moveaxis(values, axis, 0)
+        c = ndimage.spline_filter1d(known, 3, axis=0, output=np.float32, mode="mirror")
+        c = np.concatenate([c[1:2], c, c[-2:-1]])
+        fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=np.float32)
+        fine[::2] = known
+        fine[1::2] = (np.float32(23) * (c[1:-2] + c[2:-1]) + c[:-3] + c[3:]) / np.float32(48)
+        values = np.moveaxis(fine, 0, axis)
+    values = framed(np.ascontiguousarray(values))
+    nz, ny, nx = values.shape
+    grid = Grid(shape=(nz, ny, nx), voxel_mm=volume.grid.voxel_mm / 2, origin_mm=volume.grid.origin_mm)
+    return Volume(values=values, grid=grid, hull=volume.hull)
+
+
+def _continued(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a copy whose lowest and highest layer, zero, repeat the next: the sample may go on beyond them."""
+    result = values.copy()
+    result[0], result[-1] = result[1], result[-2]
+    return result

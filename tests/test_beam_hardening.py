@@ -113,7 +113,7 @@ def test_pores_are_filled_and_specks_beside_the_sample_left_out():
 
 
 def test_only_air_is_refused():
-    with pytest.raises(ValueError, match="reference radiographs: expected a sample, found only air"):
+    with pytest.raises(ValueError, match="radiographs of a full scan: expected a sample, found only air"):
         find_outline(lambda _: np.zeros((48, 52), dtype=np.float32), SCANNER, ANGLES, None)
 
 
@@ -121,5 +121,5 @@ def test_noisy_air_is_refused():
     def air(view):
         return np.random.default_rng(view).normal(0, 0.01, (48, 52)).astype(np.float32)
 
-    with pytest.raises(ValueError, match="reference radiographs: expected a sample, found only air"):
+    with pytest.raises(ValueError, match="radiographs of a full scan: expected a sample, found only air"):
         find_outline(air, SCANNER, ANGLES, None)

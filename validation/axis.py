@@ -42,12 +42,18 @@ class AxisHistory:
     """U (step, level, 3), voxels; NaN where `measured` is, so that both are averaged over the same points."""
     voxel_mm: float
 
+    @property
+    def always_observed(self) -> NDArray[np.bool_]:
+        """Return the levels (level,) that are observed at every step at which any is."""
+        observed: NDArray[np.bool_] = np.asarray(np.isfinite(self.measured).all(axis=2))
+        return np.asarray(observed[observed.any(axis=1)].all(axis=0))
+
     def translation(self, displacement: Floats) -> Floats:
-        """Return the mean over the levels that are observed at every step (step, 3), voxels.
+        """Return the mean over the levels that are always observed (step, 3), voxels.
 
         A level that comes or goes would make the mean jump.
         """
-        always = np.isfinite(self.measured).all(axis=(0, 2))
+        always = self.always_observed
         return nan_mean(displacement[:, always] if always.any() else displacement, axis=1)
 
     def stretch(self, displacement: Floats) -> Floats:

@@ -97,10 +97,12 @@ def draw_translations(axis: AxisHistory, ax: Axes) -> Axes:
     """Draw the translation averaged over the axis against the step, beside the truth."""
     measured = axis.translation(axis.measured)
     for k, (name, colour) in enumerate(zip("xyz", (BLUE, ORANGE, GREEN), strict=True)):
-        ax.plot(measured[:, k], color=colour, linewidth=2, label=rf"$\langle u_{name} \rangle$")
+        values = measured[:, k]
+        ax.plot(values, color=colour, linewidth=2, label=rf"$\langle u_{name} \rangle$", marker=_marker(values))
     if axis.true is not None:
         for k, values in enumerate(axis.translation(axis.true).T):
-            ax.plot(values, **TRUTH, label="truth" if k == 0 else None)  # type: ignore[arg-type]
+            marker = _marker(values, "+")
+            ax.plot(values, **TRUTH, label="truth" if k == 0 else None, marker=marker)  # type: ignore[arg-type]
     ax.set(xlabel="step", ylabel="mean translation (voxel)")
     micrometre = axis.voxel_mm * 1e3
 
@@ -124,7 +126,7 @@ def draw_snr(
     for values, colour, name in curves:
         known = np.asarray(values, dtype=float)
         mean = known[np.isfinite(known)].mean() if np.isfinite(known).any() else np.nan
-        ax.plot(known, color=colour, linewidth=1.6, label=f"{name}: mean {mean:.1f} dB")
+        ax.plot(known, color=colour, linewidth=1.6, label=f"{name}: mean {mean:.1f} dB", marker=_marker(known))
     limit = np.asarray(noise, dtype=float)
     if np.isfinite(limit).any():
         ax.plot(limit, **TRUTH, label="limit set by noise")  # type: ignore[arg-type]
@@ -145,7 +147,8 @@ def draw_errors(by_step: Floats, ax: Axes) -> Axes:
     """Draw the rms error of each step (step, direction), voxels, on a logarithmic scale."""
     names = ("across the beam", "vertical", "along the beam")
     for values, name, colour in zip(by_step.T, names, (BLUE, GREEN, VERMILION), strict=True):
-        ax.plot(np.where(values > 0, values, np.nan), color=colour, linewidth=1.6, label=name)
+        shown = np.where(values > 0, values, np.nan)
+        ax.plot(shown, color=colour, linewidth=1.6, label=name, marker=_marker(shown))
     if np.isfinite(by_step).any() and np.nanmax(by_step) > 0:
         ax.set_yscale("log")
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -209,6 +212,13 @@ def stretch_maps(axis: AxisHistory) -> tuple[Figure, Figure]:
 def _edges(level_mm: Floats) -> Floats:
     middle = (level_mm[1:] + level_mm[:-1]) / 2
     return np.concatenate([[1.5 * level_mm[0] - 0.5 * level_mm[1]], middle, [1.5 * level_mm[-1] - 0.5 * level_mm[-2]]])
+
+
+def _marker(values: Floats, marker: str = ".") -> str:
+    """Return the marker for a curve (step,) that has points alone between unknown ones, else none."""
+    known = np.pad(np.isfinite(values), 1)
+    alone = known[1:-1] & ~known[:-2] & ~known[2:]
+    return marker if alone.any() else "none"
 
 
 def _as_picture(ax: Axes, title: str) -> None:

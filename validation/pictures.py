@@ -44,6 +44,11 @@ def pictures(measurement: Measurement, experiment: Experiment | None, truth: Tru
     return result
 
 
+def of_volumes(measurement: Measurement) -> bool:
+    """Return whether volumes were compared, not radiographs: then no radiograph has a residual."""
+    return measurement.residual_final.size == 0
+
+
 def selected_steps(steps: int) -> list[int]:
     """Return the three steps shown, at the shares of the test that the paper shows."""
     return sorted({min(round(share * steps), steps - 1) for share in SHOWN})
@@ -82,6 +87,8 @@ def _force(measurement: Measurement, steps: Sequence[int]) -> Picture:
 
 
 def _residuals(measurement: Measurement, steps: Sequence[int]) -> list[Picture]:
+    if of_volumes(measurement):
+        return []
     rows = (
         ("fig05_residual_initial", "before any motion is measured", measurement.residual_initial),
         ("fig06_residual_rigid", "after the rigid stage", measurement.residual_rigid),
@@ -136,8 +143,13 @@ def _snr(measurement: Measurement) -> Picture:
     )  # fmt: skip
     return Picture(
         name="fig09_snr",
-        caption="Signal-to-noise ratio of each step, 20 log10(std(radiograph) / std(residual)) over the used "
-        "pixels. It swings with the turn because some angles hide the motion.",
+        caption="Signal-to-noise ratio of each step, "
+        + (
+            "20 log10(std(volume) / std(residual)) over the used voxels."
+            if of_volumes(m)
+            else "20 log10(std(radiograph) / std(residual)) over the used pixels. It swings with the turn because "
+            "some angles hide the motion."
+        ),
         figure=figure,
     )
 
@@ -165,8 +177,13 @@ def _errors(measurement: Measurement, truth: TruePoints) -> Picture:
     draw.draw_errors(point_errors(measurement, truth).by_step(), ax)
     return Picture(
         name="errors",
-        caption="Error of each step, rms over the material points between the observed sections. What one "
-        "radiograph hardly shows, the motion along its beam, is known through the steps seen from other sides.",
+        caption="Error of each step, rms over the material points between the observed sections."
+        + (
+            ""
+            if of_volumes(measurement)
+            else " What one radiograph hardly shows, the motion along its beam, is known through the steps seen from "
+            "other sides."
+        ),
         figure=figure,
     )
 

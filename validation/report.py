@@ -13,7 +13,7 @@ import numpy as np
 from pdvc.experiment import Experiment
 from pdvc.measurement import Measurement
 from validation.axis import TruePoints, axis_history, nan_mean
-from validation.pictures import pictures
+from validation.pictures import of_volumes, pictures
 from validation.scores import Scores, mean_snr, modes_found
 
 
@@ -63,6 +63,8 @@ def _page(measurement: Measurement, scores: Scores | None, shown: list[dict[str,
     return environment.get_template("report.html").render(
         title=scores.scenario if scores else measurement.title,
         m=measurement,
+        volumes=of_volumes(measurement),
+        measured=int(np.isfinite(measurement.amplitude).any(axis=(1, 2)).sum()),
         scores=scores,
         rows=summary_rows(measurement, scores),
         errors=_error_table(scores, measurement.voxel_mm * 1e3) if scores else [],
@@ -118,9 +120,8 @@ def _error_table(scores: Scores, voxel_um: float) -> list[list[str]]:
 def _extension(measurement: Measurement) -> float:
     """Return the largest difference of u_z between the ends of the observed axis, voxels."""
     axis = axis_history(measurement)
-    vertical = axis.measured[..., 2]
-    vertical = vertical[:, np.isfinite(vertical).all(axis=0)]
-    return float(np.abs(vertical[:, -1] - vertical[:, 0]).max()) if vertical.shape[1] > 1 else math.nan
+    vertical = axis.measured[:, axis.always_observed, 2]
+    return float(np.nanmax(np.abs(vertical[:, -1] - vertical[:, 0]))) if vertical.shape[1] > 1 else math.nan
 
 
 def _largest_strain(measurement: Measurement) -> float:
