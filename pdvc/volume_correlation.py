@@ -98,17 +98,13 @@ def correlate(
         bases={"rigid": rigid, "deformation": sections},
         store=store,
     )
-    references = {
-        scale: halved(
-            smoothed(
-                reference_volume(
-                    experiment, calibration, outline.hull, scale, options.beam_hardening, store, progress
-                ),
-                SMOOTHING_VOXEL,
-            )
-        )
-        for scale in bench.scales
-    }
+
+    def reference(scale: int) -> Volume:
+        hull, choice = outline.hull, options.beam_hardening
+        volume = reference_volume(experiment, calibration, hull, scale, choice, store, progress)
+        return halved(smoothed(volume, SMOOTHING_VOXEL))
+
+    references = {scale: reference(scale) for scale in bench.scales}
     prepared = time.perf_counter()
     found = {
         scan.step: store.arrays(

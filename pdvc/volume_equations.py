@@ -38,7 +38,7 @@ from pdvc.volume import Grid, Hull, Volume
 
 Floats = NDArray[np.float64]
 
-BLOCK_VOXELS = 8
+BLOCK_VOXELS = 6
 """Edge of the blocks whose residuals are taken as independent."""
 
 
@@ -131,6 +131,7 @@ def compare(pair: VolumePair, basis: SectionBasis, amplitude: Floats) -> Compari
         np.array([*target.origin_mm, target.voxel_mm]),
         moved * pair.voxel_mm,
         pair.voxel_mm,
+        BLOCK_VOXELS,
         blocks_x,
         moments,
         blocks,
@@ -173,7 +174,7 @@ def _in_layers(affine: Floats, z_mm: Floats) -> Floats:
 
 @njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 def _compare_layers(  # type: ignore[no-untyped-def]
-    reference, deformed, used, place, target, moved, voxel_mm, blocks_x, moments, blocks, chi2, residual
+    reference, deformed, used, place, target, moved, voxel_mm, edge, blocks_x, moments, blocks, chi2, residual
 ):
     """Compare layer by layer: a layer is one task, and its sums are in one order, whatever the threads."""
     for k in prange(deformed.shape[0]):
@@ -186,6 +187,7 @@ def _compare_layers(  # type: ignore[no-untyped-def]
             target,
             moved[k],
             voxel_mm,
+            edge,
             blocks_x,
             moments[k],
             blocks[k],
@@ -196,7 +198,7 @@ def _compare_layers(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _compare_layer(  # type: ignore[no-untyped-def]
-    reference, deformed, used, place, z, target, moved, voxel_mm, blocks_x, moments, blocks, chi2, residual
+    reference, deformed, used, place, z, target, moved, voxel_mm, edge, blocks_x, moments, blocks, chi2, residual
 ):
     nz, ny, nx = reference.shape
     m, step = np.empty(9), target[3]
@@ -238,7 +240,7 @@ def _compare_layer(  # type: ignore[no-untyped-def]
             m[0], m[1], m[2] = gx * x, gx * y, gx
             m[3], m[4], m[5] = gy * x, gy * y, gy
             m[6], m[7], m[8] = gz * x, gz * y, gz
-            block = (j // BLOCK_VOXELS) * blocks_x + i // BLOCK_VOXELS
+            block = (j // edge) * blocks_x + i // edge
             for row in range(9):
                 blocks[block, row] += m[row] * rho
                 for column in range(row + 1):

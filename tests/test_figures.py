@@ -100,3 +100,10 @@ def test_radiographs_show_the_used_window(case):
     figures.draw_radiographs(images, ["a", "b"], axes, window=measurement.window)
     np.testing.assert_array_equal(axes[0].lines[0].get_xdata(), np.array([6, 34, 34, 6, 6]) - 0.5)
     figure.draw_without_rendering()
+
+
+def test_steps_measured_alone_are_drawn_as_dots_and_steps_in_a_row_as_a_line():
+    for by_step, marker in ((np.ones((6, 3)), "None"), (np.where(np.arange(6)[:, None] % 2, np.nan, 1.0), ".")):
+        _, (ax,) = figures.new_figure(7, 3)
+        figures.draw_errors(np.broadcast_to(by_step, (6, 3)), ax)
+        assert {line.get_marker() for line in ax.lines} <= {marker, marker.lower()}
