@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from pdvc.history import Steps
-from pdvc.options import paper_options
+from pdvc.options import MeasureOptions, paper_options
 from validation import methods
 from validation.methods import MethodError, find_method, method_names
 
@@ -65,6 +65,18 @@ def test_the_example_of_the_documentation_is_found_and_measures(site, monkeypatc
     assert experiment == "an experiment"
     assert options.sections == 5
     assert method_names()[-1] == "five-sections"
+
+
+def test_volume_correlation_is_told_to_use_scans_and_measures_with_the_default_sections(monkeypatch):
+    handed = []
+    monkeypatch.setattr(methods, "correlate", lambda *given: handed.append(given))
+    method = find_method("volume-correlation")
+    assert method.looks_at == "volumes"
+    assert {find_method(name).looks_at for name in OURS if name != method.name} == {"projections"}
+    method.function("an experiment")
+    ((experiment, options),) = handed
+    assert experiment == "an experiment"
+    assert (options.sections, options.section_motions) == (15, MeasureOptions().section_motions)
 
 
 def options_of(name, monkeypatch, *, rows=238, steps=127):

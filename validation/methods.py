@@ -19,10 +19,11 @@ from pdvc.history import Steps
 from pdvc.measure import measure
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions, StageOptions, paper_options
+from pdvc.volume_correlation import correlate
 
 GROUP = "pdvc_bench.methods"
 """The entry-point group in which methods are looked for."""
-OWN = ("pgd", "gauss-newton", "weighted", "each-step")
+OWN = ("pgd", "gauss-newton", "weighted", "each-step", "volume-correlation")
 """Our own methods, in the order in which they are shown; others come after them."""
 
 LooksAt = Literal["projections", "volumes"]
@@ -152,3 +153,12 @@ def each_step(experiment: Experiment) -> Measurement:
         prior_voxel=30 / float(np.sqrt(len(experiment.test))),
     )
     return measure(experiment, options)
+
+
+@looks_at_volumes
+def volume_correlation(experiment: Experiment) -> Measurement:
+    """Assume sections that move rigidly or contract, and a test held at some steps for as long as a full scan takes.
+
+    Classical digital volume correlation of the interrupted scans: `pdvc.volume_correlation`.
+    """
+    return correlate(experiment, _DIRECT)
