@@ -381,27 +381,6 @@ def test_the_systematic_residual_is_taken_off_the_radiographs():
     np.testing.assert_allclose(equations.residual, corrected, atol=1e-5)
 
 
-def test_steps_in_another_order_give_the_same_motion():
-    order = np.random.default_rng(14).permutation(STEPS)
-    images = images_of("full")
-    shuffled = replace(images, rays=images.rays[order], grey=images.grey[order])
-    options = {"most_passes": 2, "least_change_voxel": 1e-9}
-    one = gauss_newton.solve(lineariser(images, SECTIONS), time_functions(), ZERO, prior(), **options)
-    two = gauss_newton.solve(lineariser(shuffled, SECTIONS), time_functions()[:, order], ZERO, prior(), **options)
-    np.testing.assert_allclose(two.coefficients, one.coefficients, atol=1e-8)
-    np.testing.assert_allclose(two.rms, one.rms, rtol=1e-6)
-
-
-def test_steps_in_another_order_have_the_same_equations_to_the_last_bit():
-    order = np.random.default_rng(14).permutation(STEPS)
-    images = images_of("full")
-    shuffled = replace(images, rays=images.rays[order], grey=images.grey[order])
-    amplitude = moved(0.7 * true_motion())
-    one, two = linearise(images, SECTIONS, amplitude), linearise(shuffled, SECTIONS, amplitude[order])
-    for name in ("matrix", "vector", "chi2", "residual"):
-        np.testing.assert_array_equal(getattr(two, name), getattr(one, name)[order], err_msg=name)
-
-
 # Why a solver stops
 
 
