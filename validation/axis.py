@@ -97,11 +97,16 @@ def current_positions(truth: TruePoints) -> Floats:
     return np.asarray(truth.point_mm[None] + truth.displacement_mm)
 
 
-def axis_history(measurement: Measurement, truth: TruePoints | None = None) -> AxisHistory:
-    """Follow the axis through the test: material levels about a section apart, or the sections themselves."""
+def axis_history(
+    measurement: Measurement, truth: TruePoints | None = None, *, spacing_mm: float | None = None
+) -> AxisHistory:
+    """Follow the axis through the test: material levels about a section apart, or the sections themselves.
+
+    With a truth, levels may also be `spacing_mm` apart: the same for measurements with different sections.
+    """
     if truth is None:
         return _at_sections(measurement)
-    chosen = _points_on_axis(truth.point_mm, _section_spacing(measurement))
+    chosen = _points_on_axis(truth.point_mm, _section_spacing(measurement) if spacing_mm is None else spacing_mm)
     true = truth.displacement_mm[:, chosen]
     measured = measured_at(measurement, truth.point_mm[chosen][None] + true)
     return AxisHistory(

@@ -56,6 +56,18 @@ Threads = Annotated[
         "--threads", min=1, metavar="N", help="Processor cores to use; all, unless given. Changes no result."
     ),
 ]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", min=1, metavar="N", help="Processes on this machine, one thread each; one for each processor."
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="A Dask scheduler to send the work to; its workers see DIR too."
+    ),
+]
 
 
 @app.callback()
@@ -258,6 +270,55 @@ def run(
         _tell(f"{part}: finished before, kept")
     Console().print(summary(outcome.scores))
     _tell(f"report: {outcome.report}")
+
+
+@app.command()
+def compare(
+    scenarios: Annotated[
+        list[str],
+        typer.Argument(metavar="SCENARIO...", help="Built-in names (see: scenarios), or paths of TOML files."),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            "--methods",
+            metavar="NAME,...",
+            help="Which methods, separated by commas; unless given: all that are installed, but for spam.",
+        ),
+    ] = None,
+    repetitions: Annotated[
+        int,
+        typer.Option("--repetitions", min=1, metavar="N", help="Noise draws of each scenario; three give intervals."),
+    ] = 3,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Let several methods measure the same experiments, and set their errors against what they cost.
+
+    Writes DIR/comparison.html, figures/, and tables as CSV, Parquet, Markdown and LaTeX. Methods that need full scans
+    get a few at interruptions of the test. Interrupted, it goes on where it was when the same command is given again.
+
+    Example:  `pdvc-bench compare quick --methods pgd,weighted,each-step -o out/compare`
+    """
+    with _answering(resume="give the same command again to go on from here") as progress:
+        from simulator.scenario import load_scenario
+        from validation.compare import Comparison
+        from validation.compare import compare as do
+        from validation.methods import default_methods, find_method
+
+        names = default_methods() if methods is None else [name.strip() for name in methods.split(",")]
+        comparison = Comparison(
+            scenarios=tuple(load_scenario(name) for name in scenarios),
+            methods=tuple(find_method(name) for name in names),
+            repetitions=repetitions,
+        )
+        comparison.check()
+        for name, note in comparison.notes().items():
+            _tell(f"{name}: {note[0].lower()}{note[1:]}")
+        page = do(comparison, out, scheduler=scheduler, workers=workers, progress=progress)
+    print((out / "methods.md").read_text(encoding="utf-8"), end="")
+    _tell(f"comparison: {page}")
 
 
 def _read_truth(folder: Path) -> Truth:

@@ -26,6 +26,9 @@ GROUP = "pdvc_bench.methods"
 OWN = ("pgd", "gauss-newton", "weighted", "each-step", "volume-correlation")
 """Our own methods, in the order in which they are shown; others come after them."""
 
+EXTRA = ("spam",)
+"""Methods that need more than our own installation, and are used only where they are asked for."""
+
 LooksAt = Literal["projections", "volumes"]
 """projections: the reference scan and a radiograph for each step; volumes: the reference and the interrupted scans."""
 
@@ -46,6 +49,10 @@ class Method:
         """Return the first paragraph of the function's docstring, in one line."""
         return " ".join((self.function.__doc__ or "").strip().partition("\n\n")[0].split())
 
+    def check(self) -> None:
+        """Raise what the function's own `check` raises, where it has one: why it cannot be used here."""
+        getattr(self.function, "check", lambda: None)()
+
     @property
     def looks_at(self) -> LooksAt:
         """Return what the method uses of an experiment, which is what it costs on the machine."""
@@ -62,6 +69,11 @@ def method_names() -> tuple[str, ...]:
     """Return the names of all methods that installed packages offer, our own first."""
     offered = {entry.name for entry in entry_points(group=GROUP)}
     return (*(name for name in OWN if name in offered), *sorted(offered.difference(OWN)))
+
+
+def default_methods() -> tuple[str, ...]:
+    """Return the names of the methods that are compared unless others are asked for."""
+    return tuple(name for name in method_names() if name not in EXTRA)
 
 
 def find_method(name: str) -> Method:
