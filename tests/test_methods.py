@@ -67,10 +67,10 @@ def test_the_example_of_the_documentation_is_found_and_measures(site, monkeypatc
     assert method_names()[-1] == "five-sections"
 
 
-def test_volume_correlation_is_told_to_use_scans_and_measures_with_the_default_sections(monkeypatch):
+def test_classical_dvc_is_told_to_use_scans_and_measures_with_the_default_sections(monkeypatch):
     handed = []
     monkeypatch.setattr(methods, "correlate", lambda *given: handed.append(given))
-    method = find_method("volume-correlation")
+    method = find_method("classical-dvc")
     assert method.looks_at == "volumes"
     assert {find_method(name).looks_at for name in OURS if name != method.name} == {"projections"}
     method.function("an experiment")

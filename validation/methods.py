@@ -23,7 +23,7 @@ from pdvc.volume_correlation import correlate
 
 GROUP = "pdvc_bench.methods"
 """The entry-point group in which methods are looked for."""
-OWN = ("pgd", "gauss-newton", "weighted", "each-step", "volume-correlation")
+OWN = ("pgd", "gauss-newton", "weighted", "each-step", "classical-dvc")
 """Our own methods, in the order in which they are shown; others come after them."""
 
 EXTRA = ("spam",)
@@ -168,7 +168,7 @@ def each_step(experiment: Experiment) -> Measurement:
 
 
 @looks_at_volumes
-def volume_correlation(experiment: Experiment) -> Measurement:
+def classical_dvc(experiment: Experiment) -> Measurement:
     """Assume sections that move rigidly or contract, and a test held at some steps for as long as a full scan takes.
 
     Classical digital volume correlation of the interrupted scans: `pdvc.volume_correlation`.
