@@ -23,8 +23,9 @@ from pdvc.equations import Equations, linearise, residuals
 from pdvc.experiment import Experiment
 from pdvc.history import time_basis
 from pdvc.measurement import Measurement, Stage
+from pdvc.noise import known_from_residual, propagate
 from pdvc.options import MeasureOptions, StageOptions, resolved
-from pdvc.preparation import Prepared, bases, calibrated, prepare, snr_of, used_window
+from pdvc.preparation import Prepared, bases, calibrated, noise_of, prepare, snr_of, used_window
 from pdvc.prior import Prior
 from pdvc.progress import Progress, silent
 from pdvc.sections import SectionBasis
@@ -70,8 +71,22 @@ def measure(
     after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
     coefficients = solver.run("deformation", sections, options.deformation, start)
     equations = solver.equations_at(sections, coefficients)
-    known = posterior(equations, time_functions, _prior(sections, options))
     amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
+    propagating = time.perf_counter()
+    noise = noise_of(experiment, calibration, fine, options.smooth_px) or known_from_residual(
+        equations.rms, fine.systematic.shape, fine.systematic.fields.shape[1:], options.smooth_px
+    )
+    propagated = propagate(
+        fine.images,
+        fine.systematic,
+        sections,
+        amplitude,
+        time_functions,
+        noise,
+        equations.residual,
+        progress=progress,
+    )
+    known = posterior(equations, time_functions, _prior(sections, options), propagated.covariance)
     amplitude[:, ~known.observed] = np.nan
     snr = snr_of(fine.images)
     ended = time.perf_counter()
@@ -86,6 +101,7 @@ def measure(
         basis=sections,
         time_functions=time_functions,
         amplitude=amplitude,
+        covariance=known.covariance,
         amplitude_std=np.where(known.observed[:, None], known.deviation, np.nan),
         data_share=np.where(known.observed[:, None], known.data_share, 0.0),
         observed=known.observed,
@@ -98,10 +114,12 @@ def measure(
         residual_initial=initial,
         residual_rigid=after_rigid,
         residual_final=equations.residual,
+        residual_tests=propagated.tests,
         seconds={
             "compile": started - compiling,
             "reconstruct": solving - started,
-            "measure": ended - solving,
+            "measure": propagating - solving,
+            "uncertainty": ended - propagating,
         },
         options=options.template(),
         versions=versions(),

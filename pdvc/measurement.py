@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pdvc.sections import SectionBasis
 
 Floats = NDArray[np.float64]
-FORMAT = 1
+_COVARIANCE_AXES = ("function", "coefficient", "coefficient_")
+FORMAT = 2
 """Raised whenever a file of an older version can no longer be read."""
 
 
@@ -48,6 +49,21 @@ class Stage:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ResidualTests:
+    """Hold how the final residual compares with the noise of radiographs, reference views and flats."""
+
+    chi2_reduced: float
+    """chi2 / (N - p): mean square of the residuals, each over its standard deviation; 1 if they are noise only."""
+    lag1_row: float
+    """Correlation of the residual with that of the next row."""
+    lag1_column: float
+    """Correlation with the next column."""
+    lag1_row_expected: float
+    """The same for noise alone, which is not white once a reference view has been interpolated."""
+    lag1_column_expected: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Measurement:
     """Hold a measured motion of a sample; voxels are `voxel_mm` large."""
 
@@ -69,6 +85,9 @@ class Measurement:
     """Section amplitudes (step, section, motion), voxels; NaN in sections that were not observed."""
     amplitude_std: Floats
     """Standard deviation of `amplitude`, voxels, from noise and prior; NaN where unknown."""
+    covariance: Floats
+    """Covariance of all coefficients (function * section * motion, the same), voxel^2, from noise and prior;
+    (function, section * motion, the same) where nothing joins the functions."""
     data_share: Floats
     """1 - posterior / prior variance of each amplitude (step, section, motion): 1 where the data
     determine it, 0 where only the prior does."""
@@ -89,6 +108,8 @@ class Measurement:
     """Residual fields (step, row, column) over the window, grey levels (air 0, largest attenuation 1)."""
     residual_rigid: NDArray[np.float32]
     residual_final: NDArray[np.float32]
+    residual_tests: ResidualTests | None = None
+    """Whether the final residual is the noise that was expected; None: not asked."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent, by part: at least ``reconstruct`` and ``measure``."""
     options: str = ""
@@ -108,6 +129,53 @@ class Measurement:
         """
         return self.basis.displacement(self.amplitude[step], points_mm)
 
+    def displacement_covariance(self, step: int, points_mm: Floats) -> Floats:
+        """Return the covariance (point, 3, 3) of u at points (point, 3) in mm, voxel^2, from noise and prior."""
+        shapes = self.basis.shapes(points_mm).reshape(len(points_mm), 3, -1)
+        return np.asarray((shapes @ self._step_covariance(step)) @ shapes.transpose(0, 2, 1))
+
+    def turned_std(self, step: int, points_mm: Floats) -> Floats:
+        """Return the standard deviations (point, 3), voxels, across the beam, vertical and along the beam."""
+        turn = directions(self.angle_rad[step])
+        turned = turn @ self.displacement_covariance(step, points_mm) @ turn.T
+        return np.asarray(np.sqrt(np.maximum(np.einsum("pii->pi", turned), 0)))
+
+    def strain_std(self, step: int, height_mm: Floats) -> Floats:
+        """Return the standard deviation (height - 1,) of the axial strain between points of the axis, without unit.
+
+        `height_mm` (height,) are current heights; the strain is that of the motion between neighbours.
+        """
+        points = np.zeros((len(height_mm), 3))
+        points[:, 2] = height_mm
+        vertical = self.basis.shapes(points)[:, 2].reshape(len(points), -1)
+        difference = np.diff(vertical, axis=0) * self.voxel_mm / np.diff(height_mm)[:, None]
+        variance = np.einsum("pi,ij,pj->p", difference, self._step_covariance(step), difference, optimize=True)
+        return np.asarray(np.sqrt(np.maximum(variance, 0)))
+
+    def _step_covariance(self, step: int) -> Floats:
+        return step_covariance(self.covariance, self.time_functions, step)
+
+
+def step_covariance(covariance: Floats, time_functions: Floats, step: int) -> Floats:
+    """Return the covariance (unknown, unknown), voxel^2, of one step's amplitudes, from that of all coefficients."""
+    sigma = time_functions[:, step]
+    if covariance.ndim == 3:
+        return np.asarray(np.tensordot(sigma**2, covariance, axes=1))
+    functions = len(sigma)
+    blocks = covariance.reshape(functions, -1, functions, len(covariance) // functions)
+    return np.asarray(np.einsum("f,fngm,g->nm", sigma, blocks, sigma, optimize=True))
+
+
+def directions(angle_rad: ArrayLike) -> Floats:
+    """Return the directions in which one radiograph sees differently well, at stage angles (...,): (..., 3, 3).
+
+    Rows: across the beam e_c, vertical e_z, along the beam e_b (`pdvc.geometry`).
+    """
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    zero = np.zeros_like(c)
+    rows = ((-s, -c, zero), (zero, zero, zero + 1), (c, -s, zero))
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
 
 def write_measurement(measurement: Measurement, path: Path) -> None:
     """Write the measurement as NetCDF, under its name only when it is complete."""
@@ -121,6 +189,9 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
             "time_functions": (("function", "step"), m.time_functions),
             "amplitude": (("step", "section", "motion"), m.amplitude, {"units": "voxel"}),
             "amplitude_std": (("step", "section", "motion"), m.amplitude_std, {"units": "voxel"}),
+            "covariance": (_COVARIANCE_AXES[-m.covariance.ndim :], m.covariance, {"units": "voxel^2"}),
+            "displacement_std": (("step", "section", "direction"), _axis_std(m), {"units": "voxel"}),
+            "strain_std": (("step", "interval"), _axis_strain_std(m)),
             "data_share": (("step", "section", "motion"), m.data_share),
             "observed": ("section", m.observed.astype(np.int8)),
             "snr_reprojection": ("view", m.snr_reprojection_db, {"units": "dB"}),
@@ -132,7 +203,7 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
             "residual_rigid": (("step", "row", "column"), m.residual_rigid),
             "residual_final": (("step", "row", "column"), m.residual_final),
         },
-        coords={"motion": list(m.basis.motions)},
+        coords={"motion": list(m.basis.motions), "direction": ["across", "vertical", "along"]},
         attrs={
             "format": FORMAT,
             "title": m.title,
@@ -143,6 +214,11 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
             "options": m.options,
             "versions": m.versions,
             **{f"seconds_{name}": value for name, value in m.seconds.items()},
+            **(
+                {f"residual_{name}": value for name, value in asdict(m.residual_tests).items()}
+                if m.residual_tests
+                else {}
+            ),
         },
     )
     for n, stage in enumerate(m.stages):
@@ -161,6 +237,21 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     data.to_netcdf(partial, engine="h5netcdf", encoding=packed)
     partial.replace(path)
+
+
+def _axis_std(m: Measurement) -> Floats:
+    """Return the standard deviations of u on the axis at each section (step, section, direction), voxels."""
+    points = np.zeros((len(m.basis.height_mm), 3))
+    points[:, 2] = m.basis.height_mm
+    result = np.stack([m.turned_std(step, points) for step in range(len(m.angle_rad))])
+    return np.where(np.isnan(m.amplitude).any(axis=2, keepdims=True), np.nan, result)
+
+
+def _axis_strain_std(m: Measurement) -> Floats:
+    """Return the standard deviations of the strain between neighbouring sections (step, section - 1)."""
+    result = np.stack([m.strain_std(step, m.basis.height_mm) for step in range(len(m.angle_rad))])
+    unknown = np.asarray(np.isnan(m.amplitude).any(axis=2))
+    return np.where(unknown[:, 1:] | unknown[:, :-1], np.nan, result)
 
 
 def _packing(values: NDArray[np.float32]) -> dict[str, object]:
@@ -217,6 +308,7 @@ def _unpack(data: xr.Dataset) -> Measurement:
         time_functions=get("time_functions"),
         amplitude=get("amplitude"),
         amplitude_std=get("amplitude_std"),
+        covariance=get("covariance"),
         data_share=get("data_share"),
         observed=get("observed").astype(bool),
         stages=stages,
@@ -228,6 +320,11 @@ def _unpack(data: xr.Dataset) -> Measurement:
         residual_initial=get("residual_initial").astype(np.float32),
         residual_rigid=get("residual_rigid").astype(np.float32),
         residual_final=get("residual_final").astype(np.float32),
+        residual_tests=ResidualTests(
+            **{each.name: float(attrs[f"residual_{each.name}"]) for each in fields(ResidualTests)}
+        )
+        if "residual_chi2_reduced" in attrs
+        else None,
         seconds={
             name.removeprefix("seconds_"): float(value)
             for name, value in attrs.items()

@@ -38,7 +38,7 @@ COARSE_TO_FINE_RIGID = (
 )
 COARSE_TO_FINE = (
     StageOptions(scale=2, most=4, passes_per_mode=8),
-    StageOptions(scale=1, solver="gauss-newton", most=2),
+    StageOptions(scale=1, solver="gauss-newton", most=4),
 )
 
 
@@ -65,6 +65,8 @@ class MeasureOptions(Settings):
     """every section by itself; one stage or several, the last at scale 1"""
     beam_hardening: Literal["fit", "none"] | tuple[float, float, float] = "fit"
     """third-order polynomial: fitted from the reference views, none, or c1, c2, c3 of attenuation"""
+    smooth_px: Annotated[float, Field(ge=0, le=5)] = 0.7
+    """standard deviation of the Gaussian that all radiographs are filtered with first, px; 0: none"""
     subtract_systematic: bool = True
     """subtract what re-projecting the volume leaves of the reference views, registered"""
     weighting: Literal["uniform", "noise"] = "uniform"
@@ -126,6 +128,7 @@ def paper_options() -> MeasureOptions:
     return MeasureOptions(
         section_motions=RIGID,
         time=PAPER,
+        smooth_px=0.0,
         rigid=(StageOptions(scale=2, most=8),),
         deformation=(StageOptions(scale=1, most=4),),
     )

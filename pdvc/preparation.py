@@ -15,18 +15,21 @@ from pdvc.beam_hardening import Outline, find_outline
 from pdvc.equations import Images
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
+from pdvc.noise import ImageNoise, Noise
 from pdvc.options import MeasureOptions, resolved
 from pdvc.progress import Progress, silent
 from pdvc.projection import project_at_rest
 from pdvc.radiographs import (
     IDENTITY,
     Calibration,
+    DetectorNoise,
     binned,
     calibrate,
     coarsened,
-    fill,
+    detector_noise,
     grey_levels,
-    grey_variance,
+    grey_noise,
+    smoothed,
     snr_db,
 )
 from pdvc.rays import ray_vectors
@@ -53,6 +56,10 @@ class Prepared:
     """Hold one scale's images with what was learnt on the way."""
 
     images: Images
+    systematic: Systematic
+    """What the volume's re-projection leaves, whether or not it is subtracted."""
+    views: NDArray[np.int64]
+    """The reference views that `systematic.fields` belong to."""
     snr_reprojection_db: Floats
     snr_noise_db: Floats
     noise_rms: float | None
@@ -141,10 +148,10 @@ def prepare(
     geometry = experiment.geometry.binned(scale)
     part = tuple(edge // scale for edge in window)
     used = geometry.cropped(*part)
-    view = _viewer(experiment.reference, calibration, scale)
-    volume = reference_volume(experiment, calibration, outline.hull, scale, options.beam_hardening, store, progress)
-    systematic, snr_reprojection = _systematic(experiment, geometry, part, view, volume, progress)
-    grey, variance = _test_radiographs(experiment, calibration, part, scale, progress)
+    view = _viewer(experiment.reference, calibration, scale, options.smooth_px)
+    volume = reference_volume(experiment, calibration, outline.hull, scale, options, store, progress)
+    systematic, views, snr_reprojection = _systematic(experiment, geometry, part, view, volume, progress)
+    grey, variance = _test_radiographs(experiment, calibration, part, scale, options.smooth_px, progress)
     good = ~_coarse_bad(calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
     if not good.any():
         raise ValueError("mask: expected some used pixels, but all of the window are bad")
@@ -166,6 +173,8 @@ def prepare(
             systematic=systematic if options.subtract_systematic else None,
             voxel_mm=experiment.geometry.voxel_mm,
         ),
+        systematic=systematic,
+        views=views,
         snr_reprojection_db=snr_reprojection,
         snr_noise_db=_noise_snr(grey, variance, good),
         noise_rms=None if variance is None else float(np.sqrt(variance[:, good].mean(dtype=float))),
@@ -182,20 +191,20 @@ def keep_volumes(
     """
     store = Store(folder, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)
-    scales, beam_hardening = volume_choices(resolved(options, experiment.geometry))
-    for scale in scales:
-        reference_volume(experiment, calibration, outline.hull, scale, beam_hardening, store, progress)
+    options = resolved(options, experiment.geometry)
+    for scale in volume_choices(options)[0]:
+        reference_volume(experiment, calibration, outline.hull, scale, options, store, progress)
 
 
-def volume_choices(options: MeasureOptions) -> tuple[tuple[int, ...], Any]:
-    """Return the options on which volumes depend, of resolved ones: scales, coarsest first, and beam hardening."""
+def volume_choices(options: MeasureOptions) -> tuple[tuple[int, ...], object, float]:
+    """Return what volumes depend on, of resolved options: scales, coarsest first, beam hardening, and filter."""
     scales = {stage.scale for stage in (*options.rigid, *options.deformation) if isinstance(stage.scale, int)}
-    return tuple(sorted(scales, reverse=True)), options.beam_hardening
+    return tuple(sorted(scales, reverse=True)), options.beam_hardening, options.smooth_px
 
 
-def _viewer(series: Series, calibration: Calibration, scale: int) -> Callable[[int], Image]:
+def _viewer(series: Series, calibration: Calibration, scale: int, smooth_px: float) -> Callable[[int], Image]:
     def view(i: int) -> Image:
-        return coarsened(grey_levels(series.counts[i], calibration), scale)
+        return coarsened(smoothed(grey_levels(series.counts[i], calibration), smooth_px), scale)
 
     return view
 
@@ -205,13 +214,15 @@ def reference_volume(
     calibration: Calibration,
     hull: Hull,
     scale: int,
-    beam_hardening: Any,
+    options: MeasureOptions,
     store: Store,
     progress: Progress,
 ) -> Volume:
     """Reconstruct the reference scan at a scale; every experiment with the same reference scan finds it kept."""
-    keep = partial(store.arrays, f"volume scale {scale} {beam_hardening}", reference_alone=True)
-    return scan_volume(experiment.reference, experiment.geometry, calibration, hull, scale, keep, progress)
+    name = f"volume scale {scale} {options.beam_hardening} {options.smooth_px}"
+    keep = partial(store.arrays, name, reference_alone=True)
+    series, geometry = experiment.reference, experiment.geometry
+    return scan_volume(series, geometry, calibration, hull, scale, options.smooth_px, keep, progress)
 
 
 def scan_volume(
@@ -220,11 +231,12 @@ def scan_volume(
     calibration: Calibration,
     hull: Hull,
     scale: int,
+    smooth_px: float,
     keep: Keep,
     progress: Progress,
 ) -> Volume:
     """Reconstruct a full scan at a scale, inside a hull; `geometry` is that of scale 1."""
-    view, geometry = _viewer(series, calibration, scale), geometry.binned(scale)
+    view, geometry = _viewer(series, calibration, scale, smooth_px), geometry.binned(scale)
     low, high = hull.box_mm()
     radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
     reach = seen_half_height_mm(geometry, radius)
@@ -249,7 +261,7 @@ def _systematic(
     view: Callable[[int], Image],
     volume: Volume,
     progress: Progress,
-) -> tuple[Systematic, Floats]:
+) -> tuple[Systematic, NDArray[np.int64], Floats]:
     """Re-project the volume at the reference views next to the steps' angles."""
     reference = experiment.reference.angle_rad
     near: Neighbours = neighbouring_views(reference, experiment.test.angle_rad)
@@ -273,7 +285,7 @@ def _systematic(
         corner=(part[0], part[2]),
         shape=(part[1] - part[0], part[3] - part[2]),
     )
-    return systematic, snr
+    return systematic, needed, snr
 
 
 def _reached_rows(geometry: ConeBeam, volume: Volume) -> slice:
@@ -288,50 +300,64 @@ def _reached_rows(geometry: ConeBeam, volume: Volume) -> slice:
 
 
 def _test_radiographs(
-    experiment: Experiment, calibration: Calibration, part: tuple[int, ...], scale: int, progress: Progress
+    experiment: Experiment,
+    calibration: Calibration,
+    part: tuple[int, ...],
+    scale: int,
+    smooth_px: float,
+    progress: Progress,
 ) -> tuple[Image, Image | None]:
     """Return grey levels and, where the noise is known, their variances, over the window (step, row, column)."""
     test = experiment.test
     window = (slice(part[0], part[1]), slice(part[2], part[3]))
     shape = (len(test), part[1] - part[0], part[3] - part[2])
     grey = np.empty(shape, dtype=np.float32)
-    known = experiment.photons_per_count is not None and experiment.readout_noise_counts is not None
-    variance = np.empty(shape, dtype=np.float32) if known else None
-    # what Gaussian filter and binning leave of white noise (white input, unit variance), by its impulse response
-    left = _noise_left(scale)
+    noise = detector_noise(experiment)
+    variance = None if noise is None else np.empty(shape, dtype=np.float32)
+    view = _viewer(test, calibration, scale, smooth_px)
+    left = _noise_left(scale, smooth_px)
     for t in range(len(test)):
-        grey[t] = coarsened(grey_levels(test.counts[t], calibration), scale)[window]
-        if variance is not None:
-            assert experiment.photons_per_count is not None
-            assert experiment.readout_noise_counts is not None
-            fine = grey_variance(
-                test.counts[t],
-                calibration,
-                photons_per_count=experiment.photons_per_count,
-                readout_noise_counts=experiment.readout_noise_counts,
-                frames=experiment.frames,
-                flats=len(experiment.flats),
-            )
-            fine = fill(fine, calibration.bad)
+        grey[t] = view(t)[window]
+        if variance is not None and noise is not None:
+            fine, slope = grey_noise(test.counts[t], calibration, noise)
+            fine += slope**2 * noise.relative_variance(calibration.open_beam, len(experiment.flats))
             variance[t] = left * binned(fine, scale)[window]
         progress(f"radiographs, scale {scale}", t + 1, len(test))
     return grey, variance
 
 
-def _noise_left(scale: int) -> float:
-    impulse = np.zeros((16 * scale, 16 * scale), dtype=np.float32)
-    impulse[8 * scale, 8 * scale] = 1
+def noise_of(experiment: Experiment, calibration: Calibration, prepared: Prepared, smooth_px: float) -> Noise | None:
+    """Return the noise of all images at scale 1, if the experiment's description tells of it."""
+    noise = detector_noise(experiment)
+    if noise is None:
+        return None
+    known: DetectorNoise = noise
+    (row, column), (rows, columns) = prepared.systematic.corner, prepared.systematic.shape
+
+    def step(t: int) -> ImageNoise:
+        variance, slope = grey_noise(experiment.test.counts[t], calibration, known)
+        window = (slice(row, row + rows), slice(column, column + columns))
+        return ImageNoise(variance=variance[window], slope=slope[window])
+
+    def view(field: int) -> ImageNoise:
+        counts = experiment.reference.counts[prepared.views[field]]
+        variance, slope = grey_noise(counts, calibration, known)
+        return ImageNoise(variance=variance, slope=slope)
+
+    flat = known.relative_variance(calibration.open_beam, len(experiment.flats))
+    return Noise(step=step, view=view, flat=flat, smooth_px=smooth_px)
+
+
+def _noise_left(scale: int, smooth_px: float) -> float:
+    """Return what filters and binning leave of the variance of white noise, by their impulse response."""
+    size = 16 * scale + 2 * int(4 * smooth_px + 1)
+    impulse = np.zeros((size - size % scale,) * 2, dtype=np.float32)
+    middle = len(impulse) // 2
+    impulse[middle, middle] = 1
     # every fine pixel of a block answers alike on average: sum over coarse pixels of the squared response
-    return float(
-        np.mean(
-            [
-                (coarsened(np.roll(impulse, (i, j), (0, 1)), scale) ** 2).sum()
-                for i in range(scale)
-                for j in range(scale)
-            ]
-        )
-        * scale**2
-    )
+    shifted = (np.roll(impulse, (i, j), (0, 1)) for i in range(scale) for j in range(scale))
+    answers = [(coarsened(smoothed(image, smooth_px), scale) ** 2).sum() for image in shifted]
+    return float(np.mean(answers) * scale**2)
 
 
 def _coarse_bad(bad: NDArray[np.bool_], scale: int) -> NDArray[np.bool_]:

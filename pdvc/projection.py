@@ -82,6 +82,37 @@ def normal_equations(
     return _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, True)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Sensitivities:
+    """Hold S_i of every pixel of one step, for the sections that its row may touch: the others' are zero."""
+
+    values: Image
+    """S (row, column, section of the row * motion), grey levels per voxel."""
+    first: NDArray[np.int64]
+    """(row,) the section that `values` starts with; sections beyond the last are zero."""
+    motions: int
+    """Motions of a section."""
+
+
+def sensitivities(
+    volume: Volume,
+    rays: Floats,
+    shape: tuple[int, int],
+    basis: SectionBasis,
+    amplitude: Floats,
+    *,
+    voxel_mm: float,
+) -> list[Sensitivities]:
+    """Return S of each step: what `normal_equations` forgets, and what noise is propagated with.
+
+    Arguments as of `project`. A step at the paper's size takes 20 MB.
+    """
+    blank = np.zeros((len(rays), *shape), dtype=np.float32)
+    fields: list[Sensitivities] = []
+    _walk(volume, rays, basis, amplitude, blank, blank[:1], voxel_mm, True, fields)
+    return fields
+
+
 def project(
     volume: Volume,
     rays: Floats,
@@ -111,9 +142,13 @@ def _walk(
     target: Image,
     weight: Image,
     voxel_mm: float,
-    sensitivities: bool,
+    with_sensitivities: bool,
+    fields: list[Sensitivities] | None = None,
 ) -> StepEquations:
-    """Prepare the steps in index coordinates of the volume, walk their rays, and add the bands in order."""
+    """Prepare the steps in index coordinates of the volume, walk their rays, and add the bands in order.
+
+    Where `fields` is a list, the sensitivities of each step are appended to it.
+    """
     grid, steps = volume.grid, len(rays)
     if amplitude.shape != (steps, *basis.shape) or not np.isfinite(amplitude).all():
         raise ValueError(f"amplitude: expected finite {(steps, *basis.shape)}, got {amplitude.shape}")
@@ -128,10 +163,11 @@ def _walk(
     boxes = np.stack([_moved_box(volume, heights, each) for each in maps])
     bands = [_band_sections(index_rays[t], target.shape[1:], heights, boxes[t]) for t in range(steps)]
     low = np.stack([lowest for lowest, _ in bands])
-    size = max(span for _, span in bands) * basis.shape[1] if sensitivities else 0
+    size = max(span for _, span in bands) * basis.shape[1] if with_sensitivities else 0
     matrices, vectors = np.zeros((*low.shape, size, size)), np.zeros((*low.shape, size))
     chi2 = np.zeros(low.shape)
     residual = np.empty(target.shape, dtype=np.float32)
+    kept = np.zeros((*target.shape, size) if fields is not None else (steps, 0, 0, 0), dtype=np.float32)
     _walk_bands(
         volume.values.reshape(-1),
         np.array(grid.shape, dtype=np.int64),
@@ -145,16 +181,22 @@ def _walk(
         target,
         weight,
         grid.voxel_mm,
-        sensitivities,
+        with_sensitivities,
         low,
         matrices,
         vectors,
         chi2,
         residual,
+        kept,
     )
-    total = basis.shape[0] * basis.shape[1] if sensitivities else 0
+    if fields is not None:
+        of_row = np.arange(target.shape[1]) // BAND_ROWS
+        fields.extend(
+            Sensitivities(values=kept[t], first=low[t, of_row], motions=basis.shape[1]) for t in range(steps)
+        )
+    total = basis.shape[0] * basis.shape[1] if with_sensitivities else 0
     matrix, vector = np.zeros((steps, total, total)), np.zeros((steps, total))
-    for t, band in np.ndindex(low.shape if sensitivities else (0, 0)):
+    for t, band in np.ndindex(low.shape if with_sensitivities else (0, 0)):
         first = int(low[t, band]) * basis.shape[1]
         count = min(size, total - first)
         here = slice(first, first + count)
@@ -432,12 +474,13 @@ def _walk_bands(  # type: ignore[no-untyped-def]
     target,
     weight,
     voxel_mm,
-    sensitivities,
+    with_sensitivities,
     low,
     matrices,
     vectors,
     chi2,
     residual,
+    kept,
 ):
     """Walk all rays of all steps, a band of rows at a time."""
     bands = low.shape[1]
@@ -456,13 +499,14 @@ def _walk_bands(  # type: ignore[no-untyped-def]
             target[t],
             weight[t % len(weight)],
             voxel_mm,
-            sensitivities,
+            with_sensitivities,
             low[t, band],
             band,
             matrices[t, band],
             vectors[t, band],
             chi2[t],
             residual[t],
+            kept[t],
         )
 
 
@@ -480,13 +524,14 @@ def _walk_band(  # type: ignore[no-untyped-def]
     target,
     weight,
     voxel_mm,
-    sensitivities,
+    with_sensitivities,
     low,
     band,
     matrix,
     vector,
     chi2,
     residual,
+    kept,
 ):
     """Walk the rays of one band of rows."""
     rows, columns = target.shape
@@ -549,7 +594,7 @@ def _walk_band(  # type: ignore[no-untyped-def]
                         am, bm, cm, ao, bo, co, az, bz, cz = turned
                         path32 = (_f(am), _f(bm), _f(cm), _f(ao), _f(bo), _f(co), _f(az), _f(bz), _f(cz))
                         scale = voxel_mm / abs(bm)
-                        if sensitivities:
+                        if with_sensitivities:
                             sums = _sum_all(volume, strides, limit, first, last, path32)
                             value += sums[0] * scale
                             nine = _nine_sums(sums, turned, along_x)
@@ -577,4 +622,7 @@ def _walk_band(  # type: ignore[no-untyped-def]
                 first, last = (k_first - low) * motions, (k_last + 1 - low) * motions
                 if w > 0:
                     _add_outer(matrix, vector, s, first, last, w, rho)
+                if kept.size > 0:
+                    for i in range(first, last):
+                        kept[row, column, i] = s[i]
                 s[first:last] = 0.0

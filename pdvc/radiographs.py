@@ -79,24 +79,39 @@ def grey_levels(counts: NDArray[np.uint16], calibration: Calibration) -> Image:
     return np.asarray(fill(grey, calibration.bad), dtype=np.float32)
 
 
-def grey_variance(
-    counts: NDArray[np.uint16],
-    calibration: Calibration,
-    *,
-    photons_per_count: float,
-    readout_noise_counts: float,
-    frames: int,
-    flats: int,
-) -> Image:
-    """Return the variance of each grey level (row, column) from photon and readout noise."""
+@dataclass(frozen=True, kw_only=True)
+class DetectorNoise:
+    """Hold the noise of a detector: what a mean of `frames` images holds of photons and readout."""
+
+    photons_per_count: float
+    readout_noise_counts: float
+    frames: int
+
+    def relative_variance(self, signal: Image, images: int = 1) -> Image:
+        """Return var I / (I - D)^2 of a mean of `images` stored images, from I - D (row, column), counts."""
+        variance = (signal / self.photons_per_count + self.readout_noise_counts**2) / (self.frames * images)
+        return np.asarray(variance / signal**2, dtype=np.float32)
+
+
+def detector_noise(experiment: Experiment) -> DetectorNoise | None:
+    """Return the noise that the experiment's description tells of, if it does."""
+    if experiment.photons_per_count is None or experiment.readout_noise_counts is None:
+        return None
+    return DetectorNoise(
+        photons_per_count=experiment.photons_per_count,
+        readout_noise_counts=experiment.readout_noise_counts,
+        frames=experiment.frames,
+    )
+
+
+def grey_noise(counts: NDArray[np.uint16], calibration: Calibration, noise: DetectorNoise) -> tuple[Image, Image]:
+    """Return the variance (row, column) of grey levels from the image's own noise, and the slope dg / dq."""
     signal = np.maximum(counts.astype(np.float32) - calibration.dark, np.float32(1))
     c1, c2, c3 = calibration.polynomial
     attenuation = np.log(calibration.open_beam / signal)
     slope = c1 + attenuation * (2 * c2 + 3 * c3 * attenuation)
-    total = np.zeros_like(signal)
-    for level, images in ((signal, frames), (calibration.open_beam, frames * flats)):
-        total += (level / photons_per_count + readout_noise_counts**2) / (images * level**2)
-    return np.asarray(slope**2 * total, dtype=np.float32)
+    variance = slope**2 * noise.relative_variance(signal)
+    return fill(np.asarray(variance, dtype=np.float32), calibration.bad), np.asarray(slope, dtype=np.float32)
 
 
 def fill(image: Image, bad: NDArray[np.bool_]) -> Image:
@@ -125,6 +140,24 @@ def coarsened(image: Image, factor: int) -> Image:
     if factor == 1:
         return image
     return binned(ndimage.gaussian_filter(image, factor / 2, mode="nearest", truncate=3), factor)
+
+
+def smoothed(image: Image, smooth_px: float) -> Image:
+    """Filter with a Gaussian of this standard deviation, px.
+
+    Bilinear interpolation errs on details of a pixel or two, and leaves less noise between pixels than on them:
+    both pull at the motion. A filter takes these details from radiographs and volume alike.
+    """
+    return image if smooth_px == 0 else np.asarray(ndimage.gaussian_filter(image, smooth_px, mode="nearest"))
+
+
+def noise_overlap(smooth_px: float) -> tuple[float, float, float]:
+    """Return the covariance of filtered white noise, along one axis, of a pixel with itself and with the next two."""
+    impulse = np.zeros(2 * int(4 * smooth_px + 0.5) + 7)
+    impulse[len(impulse) // 2] = 1
+    kernel = impulse if smooth_px == 0 else ndimage.gaussian_filter1d(impulse, smooth_px)
+    c0, c1, c2 = (float(kernel[: len(kernel) - lag] @ kernel[lag:]) for lag in range(3))
+    return c0, c1, c2
 
 
 def binned(image: Image, factor: int) -> Image:

@@ -84,6 +84,13 @@ class SectionBasis:
             return np.ones((*z.shape, 1))
         return np.stack([np.interp(z, self.height_mm, row) for row in identity], axis=-1)
 
+    def shapes(self, points_mm: ArrayLike) -> Floats:
+        """Return what each unit amplitude moves at points x (point, 3), mm: (point, 3, section, motion), voxels."""
+        points = np.asarray(points_mm, dtype=float)
+        patterns = self.patterns()
+        moved = np.einsum("jkab,pb->pajk", patterns[..., :3], points) + np.moveaxis(patterns[..., 3], 2, 0)
+        return np.asarray(moved * self.weights(points[:, 2])[:, None, :, None])
+
     def displacement(self, amplitude: ArrayLike, points_mm: ArrayLike) -> Floats:
         """Return u, in voxels, at points x (point, 3) in mm of the *current* configuration.
 

@@ -74,11 +74,19 @@ class Systematic:
         for the steps of the range.
         """
         result = np.empty((len(rays), *self.shape), dtype=np.float32)
-        _register(
-            self.fields,
-            self.first[steps],
-            self.second[steps],
-            self.share[steps],
+        maps = basis.affine(amplitude) * voxel_mm
+        corner = np.array(self.corner, dtype=np.int64)
+        chosen = self.first[steps], self.second[steps], self.share[steps]
+        _register(self.fields, *chosen, rays, basis.height_mm, maps, corner, result)
+        return result
+
+    def places(self, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Floats:
+        """Return where e is taken for each pixel of one step: (row, column, 2), row and column on the detector.
+
+        `rays` (4, 3) of the window, mm; `amplitude` (section, motion) in voxels of `voxel_mm`.
+        """
+        result = np.empty((*self.shape, 2))
+        _find_places(
             rays,
             basis.height_mm,
             basis.affine(amplitude) * voxel_mm,
@@ -106,41 +114,64 @@ def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
     return m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def _place(rays, normal, depth, pitch2, heights, maps, corner, row, column):  # type: ignore[no-untyped-def]
+    """Return the row and the column, on the whole detector, where a pixel's material was seen before it moved."""
+    n = len(heights)
+    sx, sy, sz = rays[0]
+    ox, oy, oz = rays[1]
+    dx, dy, dz = rays[2]
+    rx, ry, rz = rays[3]
+    x, y, z = ox + row * dx + column * rx, oy + row * dy + column * ry, oz + row * dz + column * rz
+    x, y, z = x - sx, y - sy, z - sz
+    # the point of the ray that is nearest to the axis
+    at = -(sx * x + sy * y) / (x * x + y * y)
+    x, y, z = sx + at * x, sy + at * y, sz + at * z
+    k = 0
+    while k + 2 < n and heights[k + 1] < z:
+        k += 1
+    ux, uy, uz = _moved(maps[k], 0, x, y, z), _moved(maps[k], 1, x, y, z), _moved(maps[k], 2, x, y, z)
+    if n > 1:
+        s = min(max((z - heights[k]) / (heights[k + 1] - heights[k]), 0.0), 1.0)
+        m = maps[k + 1]
+        ux += s * (_moved(m, 0, x, y, z) - ux)
+        uy += s * (_moved(m, 1, x, y, z) - uy)
+        uz += s * (_moved(m, 2, x, y, z) - uz)
+    x, y, z = x - ux - sx, y - uy - sy, z - uz - sz
+    scale = depth / (x * normal[0] + y * normal[1] + z * normal[2])
+    x, y, z = sx + scale * x - ox, sy + scale * y - oy, sz + scale * z - oz
+    return (x * dx + y * dy + z * dz) / pitch2 + corner[0], (x * rx + y * ry + z * rz) / pitch2 + corner[1]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _panel(rays):  # type: ignore[no-untyped-def]
+    """Return the detector's normal, its distance from the source along it, and the square of the pitch."""
+    dx, dy, dz = rays[2]
+    rx, ry, rz = rays[3]
+    nx, ny, nz = dy * rz - dz * ry, dz * rx - dx * rz, dx * ry - dy * rx
+    depth = (rays[1, 0] - rays[0, 0]) * nx + (rays[1, 1] - rays[0, 1]) * ny + (rays[1, 2] - rays[0, 2]) * nz
+    return (nx, ny, nz), depth, dx * dx + dy * dy + dz * dz
+
+
 @njit(nogil=True, cache=True, parallel=True, error_model="numpy")
 def _register(fields, first, second, share, rays, heights, maps, corner, out):  # type: ignore[no-untyped-def]
     """Sample the fields where each pixel's material was before it moved."""
-    n, rows = len(heights), out.shape[1]
+    rows = out.shape[1]
     for task in prange(len(out) * rows):
         t, row = task // rows, task % rows
-        sx, sy, sz = rays[t, 0]
-        ox, oy, oz = rays[t, 1]
-        dx, dy, dz = rays[t, 2]
-        rx, ry, rz = rays[t, 3]
-        pitch2 = dx * dx + dy * dy + dz * dz
-        nx, ny, nz = dy * rz - dz * ry, dz * rx - dx * rz, dx * ry - dy * rx
-        depth = (ox - sx) * nx + (oy - sy) * ny + (oz - sz) * nz
+        normal, depth, pitch2 = _panel(rays[t])
         for column in range(out.shape[2]):
-            x, y, z = ox + row * dx + column * rx, oy + row * dy + column * ry, oz + row * dz + column * rz
-            x, y, z = x - sx, y - sy, z - sz
-            # the point of the ray that is nearest to the axis
-            at = -(sx * x + sy * y) / (x * x + y * y)
-            x, y, z = sx + at * x, sy + at * y, sz + at * z
-            k = 0
-            while k + 2 < n and heights[k + 1] < z:
-                k += 1
-            ux, uy, uz = _moved(maps[t, k], 0, x, y, z), _moved(maps[t, k], 1, x, y, z), _moved(maps[t, k], 2, x, y, z)
-            if n > 1:
-                s = min(max((z - heights[k]) / (heights[k + 1] - heights[k]), 0.0), 1.0)
-                m = maps[t, k + 1]
-                ux += s * (_moved(m, 0, x, y, z) - ux)
-                uy += s * (_moved(m, 1, x, y, z) - uy)
-                uz += s * (_moved(m, 2, x, y, z) - uz)
-            x, y, z = x - ux - sx, y - uy - sy, z - uz - sz
-            scale = depth / (x * nx + y * ny + z * nz)
-            x, y, z = sx + scale * x - ox, sy + scale * y - oy, sz + scale * z - oz
-            r = (x * dx + y * dy + z * dz) / pitch2 + corner[0]
-            c = (x * rx + y * ry + z * rz) / pitch2 + corner[1]
+            r, c = _place(rays[t], normal, depth, pitch2, heights, maps[t], corner, row, column)
             value = _bilinear(fields[first[t]], r, c)
             if share[t] > 0:
                 value += share[t] * (_bilinear(fields[second[t]], r, c) - value)
             out[t, row, column] = value
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _find_places(rays, heights, maps, corner, out):  # type: ignore[no-untyped-def]
+    """Write the places of all pixels of one step."""
+    normal, depth, pitch2 = _panel(rays)
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            out[row, column] = _place(rays, normal, depth, pitch2, heights, maps, corner, row, column)

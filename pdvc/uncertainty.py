@@ -1,13 +1,14 @@
 """Covariance of the amplitudes, and what the data determine.
 
-At the solution, with H the Hessian of all unknowns (gauss_newton.hessian), gamma the rms residual and P the prior's
-precision, the posterior covariance is
+At the solution, with H the Hessian of all unknowns (gauss_newton.hessian), V the covariance of its right-hand side
+(`pdvc.noise`), gamma the rms residual and P the prior's precision, an error of the amplitudes is
+(H + gamma^2 P)^-1 times what noise does to the right-hand side, and what the prior pulls there. Their covariance is
 
-    C = gamma^2 (H + gamma^2 P)^-1
+    C = A^-1 (V + gamma^4 P) A^-1,        A = H + gamma^2 P
 
-for white residuals of standard deviation gamma. The share 1 - C_ii P_ii of an unknown's prior variance that the data
-removed is near 1 where they determine it, near 0 where the value rests on the prior. A section that no used
-pixel sees is unobserved.
+which is gamma^2 A^-1 if the residuals are white, V = gamma^2 H. It holds noise and prior; not what the model cannot
+follow. The share 1 - C_ii P_ii of an unknown's prior variance that the data removed is near 1 where they determine
+it, near 0 where the value rests on the prior. A section that no used pixel sees is unobserved.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from numpy.typing import NDArray
 
 from pdvc.equations import Equations
 from pdvc.gauss_newton import hessian
+from pdvc.measurement import step_covariance
+from pdvc.noise import separate
 from pdvc.prior import LEAST_RMS, Prior, solved
 
 Floats = NDArray[np.float64]
@@ -31,6 +34,9 @@ UNSEEN = 1e-6
 class Posterior:
     """Hold how well each step's amplitudes are known."""
 
+    covariance: Floats
+    """C (function * unknown, function * unknown), voxel^2, with unknown = section * motion; or (function, unknown,
+    unknown), where each step has a function of its own and nothing joins them."""
     deviation: Floats
     """Standard deviations (step, section, motion), voxels."""
     data_share: Floats
@@ -39,23 +45,39 @@ class Posterior:
     """(section,)"""
 
 
-def posterior(equations: Equations, time_functions: Floats, prior: Prior) -> Posterior:
-    """Return the standard deviations that white residuals of the observed size leave."""
+def posterior(equations: Equations, time_functions: Floats, prior: Prior, noise: Floats | None = None) -> Posterior:
+    """Return what noise and prior leave uncertain.
+
+    `noise` is V (noise.Propagated.covariance); without it residuals are taken as white, of the observed size.
+    """
     shape = prior.deviation_voxel.shape
-    functions, steps = time_functions.shape
-    size = shape[0] * shape[1]
+    steps = time_functions.shape[1]
+    ridge, precision = prior.ridge(equations.rms), prior.precision()
     gamma2 = max(equations.rms, LEAST_RMS) ** 2
-    precision = prior.precision()
-    matrix = hessian(equations, time_functions)
-    matrix[np.diag_indices_from(matrix)] += np.tile(prior.ridge(equations.rms), functions)
-    inverse = solved(matrix, np.eye(len(matrix))) * gamma2
-    blocks = inverse.reshape(functions, size, functions, size)
-    same = np.einsum("fngn->nfg", blocks)
-    variance = np.einsum("ft,nfg,gt->tn", time_functions, same, time_functions, optimize=True)
+    if separate(time_functions):
+        scale = (time_functions**2).sum(axis=1)
+        matrices = [s * equations.matrix[np.argmax(f != 0)] for s, f in zip(scale, time_functions, strict=True)]
+        noises = [gamma2 * matrix for matrix in matrices] if noise is None else list(noise)
+        covariance = np.stack([sandwich(m, v, ridge, gamma2) for m, v in zip(matrices, noises, strict=True)])
+    else:
+        matrix = hessian(equations, time_functions)
+        covariance = sandwich(
+            matrix, gamma2 * matrix if noise is None else noise, np.tile(ridge, len(time_functions)), gamma2
+        )
+    variance = np.stack([np.diag(step_covariance(covariance, time_functions, t)) for t in range(steps)])
     before = (time_functions**2).sum(axis=0)[:, None] / precision
     information = np.einsum("tnn->n", equations.matrix).reshape(shape).sum(axis=1)
     return Posterior(
+        covariance=covariance,
         deviation=np.sqrt(np.maximum(variance, 0)).reshape(steps, *shape),
         data_share=np.clip(1 - variance / before, 0, 1).reshape(steps, *shape),
         observed=information > UNSEEN * np.median(information),
     )
+
+
+def sandwich(matrix: Floats, noise: Floats, ridge: Floats, gamma2: float) -> Floats:
+    """Return C from H, V, the flat diagonal of gamma^2 P, and gamma^2."""
+    total, middle = matrix + np.diag(ridge), noise + np.diag(gamma2 * ridge)
+    half = solved(total, middle)
+    whole = solved(total, half.T)
+    return np.asarray((whole + whole.T) / 2)

@@ -43,13 +43,13 @@ from pdvc.measure import versions
 from pdvc.measurement import Measurement, Stage
 from pdvc.options import MeasureOptions, coarse_scale, resolved
 from pdvc.preparation import bases, calibrated, outlined, reference_volume, scan_volume, used_window
-from pdvc.prior import LEAST_RMS, Prior, solved
+from pdvc.prior import LEAST_RMS, Prior
 from pdvc.progress import Progress, silent
 from pdvc.radiographs import IDENTITY, Calibration, snr_db
 from pdvc.sections import SectionBasis
 from pdvc.solution import Solution
 from pdvc.store import Store
-from pdvc.uncertainty import UNSEEN
+from pdvc.uncertainty import UNSEEN, sandwich
 from pdvc.volume import Volume, halved, smoothed
 from pdvc.volume_equations import Comparison, VolumePair, compare, used_voxels
 
@@ -86,7 +86,8 @@ def correlate(
     compile_kernels(progress=progress)
     compile_comparison()
     started = time.perf_counter()
-    options = resolved(options, experiment.geometry)
+    # volumes are filtered here, not the radiographs
+    options = resolved(options, experiment.geometry).model_copy(update={"smooth_px": 0.0})
     window = used_window(experiment.geometry, options)
     store = Store(work, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)
@@ -100,8 +101,7 @@ def correlate(
     )
 
     def reference(scale: int) -> Volume:
-        hull, choice = outline.hull, options.beam_hardening
-        volume = reference_volume(experiment, calibration, hull, scale, choice, store, progress)
+        volume = reference_volume(experiment, calibration, outline.hull, scale, options, store, progress)
         return halved(smoothed(volume, SMOOTHING_VOXEL))
 
     references = {scale: reference(scale) for scale in bench.scales}
@@ -137,6 +137,8 @@ def correlate(
         basis=sections,
         time_functions=time_basis((Steps(),), experiment.test)[steps],
         amplitude=np.where(observed[:, None], at_steps("amplitude"), np.nan),
+        # coefficients multiply a function that is sqrt(steps) at its scan
+        covariance=np.stack([each["covariance"] for each in found.values()]) / len(experiment.test),
         amplitude_std=np.where(observed[:, None], at_steps("deviation"), np.nan),
         data_share=np.where(observed[:, None], at_steps("data_share"), 0.0),
         observed=observed,
@@ -199,7 +201,7 @@ class _Bench:
 
         def pair(scale: int) -> VolumePair:
             keep = partial(self.store.arrays, f"volume of step {scan.step}, scale {scale} {choice}")
-            volume = scan_volume(series, self.geometry, calibration, outline.hull, scale, keep, progress)
+            volume = scan_volume(series, self.geometry, calibration, outline.hull, scale, 0.0, keep, progress)
             return VolumePair(
                 reference=references[scale],
                 deformed=smoothed(volume, SMOOTHING_VOXEL),
@@ -284,16 +286,10 @@ def _prior(basis: SectionBasis, options: MeasureOptions) -> Prior:
 
 
 def _covariance(comparison: Comparison, prior: Prior) -> Floats:
-    """Return C = A^-1 (cov c + gamma^4 P) A^-1 (section * motion, the same), voxel^2.
-
-    A = B + gamma^2 P, with P the prior's precision and gamma the rms residual.
-    """
+    """Return the covariance (section * motion, the same), voxel^2, of the amplitudes at a comparison."""
     equations = comparison.equations()
-    ridge, gamma2 = prior.ridge(equations.rms), max(equations.rms, LEAST_RMS) ** 2
-    total = equations.matrix[0] + np.diag(ridge)
-    half = solved(total, comparison.vector_covariance() + np.diag(gamma2 * ridge))
-    whole = solved(total, half.T)
-    return np.asarray((whole + whole.T) / 2)
+    gamma2 = max(equations.rms, LEAST_RMS) ** 2
+    return sandwich(equations.matrix[0], comparison.vector_covariance(), prior.ridge(equations.rms), gamma2)
 
 
 def _stages(bench: _Bench, found: Mapping[int, Mapping[str, NDArray[Any]]], steps: int) -> tuple[Stage, ...]:

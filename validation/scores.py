@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc.measurement import Measurement, MeasurementError
+from pdvc.measurement import Measurement, MeasurementError, directions
 from validation.axis import TruePoints, axis_history, current_positions, measured_at, nan_mean
 
 Floats = NDArray[np.float64]
@@ -138,10 +138,7 @@ def point_errors(measurement: Measurement, truth: TruePoints) -> Errors:
         )
     error = measured_at(measurement, current_positions(truth))
     error -= truth.displacement_mm / measurement.voxel_mm
-    c, s = np.cos(measurement.angle_rad)[:, None], np.sin(measurement.angle_rad)[:, None]
-    across = -s * error[..., 0] - c * error[..., 1]
-    along = c * error[..., 0] - s * error[..., 1]
-    return Errors(components=np.stack([across, error[..., 2], along], axis=-1))
+    return Errors(components=error @ directions(measurement.angle_rad).transpose(0, 2, 1))
 
 
 def score(
