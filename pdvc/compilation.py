@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from pdvc.equations import Images
 from pdvc.geometry import ConeBeam
+from pdvc.noise import known_from_residual, propagate
 from pdvc.progress import Progress, silent
 from pdvc.projection import normal_equations, project
 from pdvc.rays import ray_vectors
@@ -40,6 +42,10 @@ def compile_kernels(*, progress: Progress = silent) -> None:
     shape = (geometry.rows, geometry.columns)
     systematic = Systematic(fields=views[:1], first=first, second=first, share=np.zeros(1), corner=(0, 0), shape=shape)
     systematic.registered(slice(0, 1), rays, basis, still, 0.1)
+    images = Images(
+        rays=rays, grey=views[:1], weight=views[:1], volume=volume, systematic=systematic, voxel_mm=grid.voxel_mm
+    )
+    propagate(images, systematic, basis, still, np.ones((1, 1)), known_from_residual(1.0, shape, shape, 0), views[:1])
     progress(TASK, 3, 3)
 
 

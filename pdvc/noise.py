@@ -137,8 +137,7 @@ def propagate(
         here.add(t, own, -image.slope, systematic.corner)
         if static is not None:
             static[time_functions[:, t] != 0] += here.covariance(noise.flat, unknowns)
-        known = image.variance + image.slope**2 * _window(noise.flat, systematic)
-        tests.add(residual[t], weight > 0, known, view.variance + view.slope**2 * noise.flat, places)
+        tests.add(residual[t], weight > 0, image, view, noise.flat, places, systematic.corner)
         return moved
 
     for view in sorted(users):
@@ -193,15 +192,12 @@ def _between(noise: Noise, systematic: Systematic, step: int) -> ImageNoise:
     )
 
 
-def _window(image: Image, systematic: Systematic) -> Image:
-    (row, column), (rows, columns) = systematic.corner, systematic.shape
-    return image[row : row + rows, column : column + columns]
-
-
 def _fields(
     images: Images, basis: SectionBasis, amplitude: Floats, wanted: list[int]
 ) -> Iterator[tuple[int, Sensitivities]]:
     """Yield the sensitivities of the wanted steps."""
+    if not wanted:
+        return
     shape = (images.grey.shape[1], images.grey.shape[2])
     found = sensitivities(
         images.volume, images.rays[wanted], shape, basis, amplitude[wanted], voxel_mm=images.voxel_mm
@@ -313,35 +309,60 @@ class _Pile:
 class _Tests:
     """Sum what tells whether the residual is the noise that is expected."""
 
-    def __init__(self, overlap: tuple[float, float, float]) -> None:
+    def __init__(self, overlap: Floats) -> None:
         self._overlap = overlap
         self._chi2, self._pixels = 0.0, 0
         self._seen, self._expected, self._pairs = np.zeros(2), np.zeros(2), np.zeros(2)
 
-    def add(self, residual: Image, used: NDArray[np.bool_], known: Image, views: Image, places: Floats) -> None:
-        """Add a step: `known` and `views` are the variances over the window and, to be interpolated, the detector."""
-        c0, c1, c2 = self._overlap
-        at = [np.clip(places[..., k].astype(int), 0, views.shape[k] - 2) for k in range(2)]
+    def add(
+        self,
+        residual: Image,
+        used: NDArray[np.bool_],
+        image: ImageNoise,
+        view: ImageNoise,
+        flat: Image,
+        places: Floats,
+        corner: tuple[int, int],
+    ) -> None:
+        """Add a step: its radiograph's noise over the window, its views' and the flats' over the detector.
+
+        Noise varies little from pixel to pixel, so that it is taken from the pixel above and left of a place.
+        """
+        c = self._overlap
+        at = [np.clip(places[..., k].astype(int), 0, flat.shape[k] - 2) for k in range(2)]
         a, b = (places[..., k] - at[k] for k in range(2))
         # interpolated between two pixels whose noise overlaps: variance along an axis, and covariance with the next
-        same = [(1 - x) ** 2 * c0 + x**2 * c0 + 2 * x * (1 - x) * c1 for x in (a, b)]
-        following = [((1 - x) ** 2 + x**2) * c1 + x * (1 - x) * (c0 + c2) for x in (a, b)]
-        moved = views[at[0], at[1]]
-        variance = c0**2 * known + same[0] * same[1] * moved
+        same = [((1 - x) ** 2 + x**2) * c[0] + 2 * x * (1 - x) * c[1] for x in (a, b)]
+        following = [((1 - x) ** 2 + x**2) * c[1] + x * (1 - x) * (c[0] + c[2]) for x in (a, b)]
+        pixel = np.indices(residual.shape) + np.array(corner)[:, None, None]
+
+        def flats(shift: int) -> tuple[Floats, Floats]:
+            """Return the covariance of a pixel with its place, moved by a shift, along each axis."""
+            lags = [np.minimum(np.abs(at[k] + n + shift - pixel[k]), len(c) - 1) for k in range(2) for n in range(2)]
+            return (1 - a) * c[lags[0]] + a * c[lags[1]], (1 - b) * c[lags[2]] + b * c[lags[3]]
+
+        (down, across), before, after = flats(0), flats(-1), flats(1)
+        here = flat[pixel[0], pixel[1]]
+        there, slope = flat[at[0], at[1]], view.slope[at[0], at[1]]
+        known = image.variance + image.slope**2 * here
+        moved = view.variance[at[0], at[1]] + slope**2 * there
+        # the flats are the same in both
+        twice = 2 * image.slope * slope * np.sqrt(here * there)
+        variance = c[0] ** 2 * known + same[0] * same[1] * moved - twice * down * across
         white = np.where(used, residual / np.sqrt(variance), 0)
         self._chi2 += float((white**2).sum())
         self._pixels += int(used.sum())
         shared = (
-            (c1 * c0 * known + following[0] * same[1] * moved) / variance,
-            (c0 * c1 * known + same[0] * following[1] * moved) / variance,
+            c[1] * c[0] * known + following[0] * same[1] * moved - twice * (before[0] + after[0]) / 2 * across,
+            c[0] * c[1] * known + same[0] * following[1] * moved - twice * down * (before[1] + after[1]) / 2,
         )
         for axis in range(2):
-            here, neighbour = [slice(None)] * 2, [slice(None)] * 2
-            here[axis], neighbour[axis] = slice(None, -1), slice(1, None)
-            both = used[tuple(here)] & used[tuple(neighbour)]
-            self._seen[axis] += float((white[tuple(here)] * white[tuple(neighbour)]).sum())
-            self._expected[axis] += float(shared[axis][tuple(here)][both].sum())
-            self._pairs[axis] += int(both.sum())
+            first, second = [slice(None)] * 2, [slice(None)] * 2
+            first[axis], second[axis] = slice(None, -1), slice(1, None)
+            pairs = used[tuple(first)] & used[tuple(second)]
+            self._seen[axis] += float((white[tuple(first)] * white[tuple(second)]).sum())
+            self._expected[axis] += float((shared[axis] / variance)[tuple(first)][pairs].sum())
+            self._pairs[axis] += int(pairs.sum())
 
     def result(self, unknowns: int) -> ResidualTests:
         """Return the tests, of a solution with so many unknowns."""

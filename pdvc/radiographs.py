@@ -151,13 +151,16 @@ def smoothed(image: Image, smooth_px: float) -> Image:
     return image if smooth_px == 0 else np.asarray(ndimage.gaussian_filter(image, smooth_px, mode="nearest"))
 
 
-def noise_overlap(smooth_px: float) -> tuple[float, float, float]:
-    """Return the covariance of filtered white noise, along one axis, of a pixel with itself and with the next two."""
-    impulse = np.zeros(2 * int(4 * smooth_px + 0.5) + 7)
+def noise_overlap(smooth_px: float) -> Floats:
+    """Return the covariance (lag,) of filtered white noise, along one axis, of a pixel with those 0, 1, 2 ... further.
+
+    At least three lags; zero from the last one on.
+    """
+    reach = int(4 * smooth_px + 0.5)
+    impulse = np.zeros(4 * reach + 7)
     impulse[len(impulse) // 2] = 1
     kernel = impulse if smooth_px == 0 else ndimage.gaussian_filter1d(impulse, smooth_px)
-    c0, c1, c2 = (float(kernel[: len(kernel) - lag] @ kernel[lag:]) for lag in range(3))
-    return c0, c1, c2
+    return np.array([kernel[: len(kernel) - lag] @ kernel[lag:] for lag in range(2 * reach + 3)])
 
 
 def binned(image: Image, factor: int) -> Image:

@@ -102,6 +102,7 @@ def measurement(amplitude: Floats, *, unobserved: tuple[int, ...] = (), title: s
         time_functions=np.linalg.qr(rng.normal(size=(steps, 7)))[0].T,
         amplitude=amplitude,
         amplitude_std=np.full_like(amplitude, 0.02),
+        covariance=4e-4 / steps * np.eye(7 * sections * motions),
         data_share=np.broadcast_to(np.linspace(0.2, 1, motions), amplitude.shape).copy(),
         observed=observed,
         stages=(stage("rigid", 5, 1), stage("deformation", 3, sections)),

@@ -12,12 +12,15 @@ from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
 from pdvc.radiographs import (
     Calibration,
+    DetectorNoise,
     binned,
     calibrate,
     coarsened,
     fill,
     grey_levels,
-    grey_variance,
+    grey_noise,
+    noise_overlap,
+    smoothed,
     snr_db,
 )
 from pdvc.rays import ray_vectors
@@ -170,14 +173,9 @@ def test_the_variance_of_grey_levels_is_that_of_many_draws():
         open_beam=np.full((1, 5), beam, dtype=np.float32),
         bad=calibration.bad[:1],
     )
-    predicted = grey_variance(
-        np.round(dark + beam * np.exp(-attenuation)).astype(np.uint16),
-        ideal,
-        photons_per_count=photons,
-        readout_noise_counts=readout,
-        frames=frames,
-        flats=flats,
-    )[0]
+    noise = DetectorNoise(photons_per_count=photons, readout_noise_counts=readout, frames=frames)
+    own, slope = grey_noise(np.round(dark + beam * np.exp(-attenuation)).astype(np.uint16), ideal, noise)
+    predicted = (own + slope**2 * noise.relative_variance(ideal.open_beam, flats))[0]
     # a variance from 4000 draws is known to 2.2 %
     np.testing.assert_allclose(predicted, scattered, rtol=0.08)
 
@@ -224,3 +222,13 @@ def test_snr_is_20_db_for_each_factor_of_ten_whatever_the_offsets(scale, offset,
     residual = (signal * scale + offset).astype(np.float32)
     residual[:2] = 1e6
     assert snr_db(signal, residual, used) == pytest.approx(-20 * np.log10(scale), abs=2e-2)
+
+
+@pytest.mark.parametrize("smooth_px", [0.0, 0.5, 0.7, 1.5])
+def test_filtered_noise_overlaps_with_its_neighbours_as_told(smooth_px):
+    rng = np.random.default_rng(4)
+    noise = smoothed(rng.normal(size=(400, 500)).astype(np.float32), smooth_px)[8:-8, 8:-8].astype(float)
+    c0, c1, c2 = noise_overlap(smooth_px)[:3]
+    seen = [(noise * noise).mean(), (noise[:, 1:] * noise[:, :-1]).mean(), (noise[2:] * noise[:-2]).mean()]
+    # 200 000 pixels, of which some ten are alike: known to half a per cent
+    np.testing.assert_allclose(seen, [c0 * c0, c0 * c1, c0 * c2], atol=0.02 * c0 * c0)
