@@ -153,6 +153,8 @@ class Measurement:
         return np.asarray(np.sqrt(np.maximum(variance, 0)))
 
     def _step_covariance(self, step: int) -> Floats:
+        if not self.time_functions[:, step].any():  # nothing was measured at this step
+            return np.full((np.prod(self.basis.shape),) * 2, np.nan)
         return step_covariance(self.covariance, self.time_functions, step)
 
 

@@ -60,6 +60,14 @@ def test_the_record_tells_which_steps_were_scanned(measured):
     for name in ("amplitude", "amplitude_std", "snr_initial_db", "snr_rigid_db", "snr_final_db"):
         known = np.isfinite(getattr(measured, name)).reshape(18, -1)
         np.testing.assert_array_equal(known, np.broadcast_to(held[:, None], known.shape), err_msg=name)
+    points = np.zeros((4, 3))
+    points[:, 2] = measured.basis.height_mm
+    for step in range(18):
+        told = np.concatenate([measured.turned_std(step, points).ravel(), measured.strain_std(step, points[:, 2])])
+        assert np.isfinite(told).all() if held[step] else np.isnan(told).all()
+        assert not (told <= 0).any()
+    # at the height of a section its translations alone move the axis
+    np.testing.assert_allclose(measured.turned_std(12, points)[:, 1], measured.amplitude_std[12, :, 2])
     np.testing.assert_allclose(measured.time_functions @ measured.time_functions.T / 18, np.eye(3), atol=1e-12)
     np.testing.assert_array_equal(measured.time_functions.argmax(axis=1), HELD)
     assert measured.observed.all()
