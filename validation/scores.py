@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from pdvc.measurement import Measurement, MeasurementError, directions
 from validation.axis import TruePoints, axis_history, current_positions, measured_at, nan_mean
+from validation.calibration import Calibration, calibration
 
 Floats = NDArray[np.float64]
 
@@ -80,6 +81,10 @@ class Scores:
     """rms over scored points and steps"""
     bias_voxel: Directions
     random_voxel: Directions
+    calibration: Calibration
+    """whether the predicted standard deviations are those of the errors"""
+    chi2_reduced: float
+    """mean square of the residuals, each over its standard deviation; 1 if they are noise only; NaN: not asked"""
     strain_rms: float
     """rms difference of measured and true strain on the axis, over steps and intervals between levels"""
     max_strain_true: float
@@ -164,6 +169,8 @@ def score(
         error_voxel=errors.rms(),
         bias_voxel=errors.bias(),
         random_voxel=errors.random(),
+        calibration=calibration(measurement, truth, errors.components),
+        chi2_reduced=math.nan if measurement.residual_tests is None else measurement.residual_tests.chi2_reduced,
         strain_rms=float(_rms(measured - true)),
         max_strain_true=_largest(true),
         max_strain_measured=_largest(measured),
