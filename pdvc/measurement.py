@@ -129,28 +129,16 @@ class Measurement:
         """
         return self.basis.displacement(self.amplitude[step], points_mm)
 
-    def displacement_covariance(self, step: int, points_mm: Floats) -> Floats:
-        """Return the covariance (point, 3, 3) of u at points (point, 3) in mm, voxel^2, from noise and prior."""
-        shapes = self.basis.shapes(points_mm).reshape(len(points_mm), 3, -1)
-        return np.asarray((shapes @ self._step_covariance(step)) @ shapes.transpose(0, 2, 1))
-
     def turned_std(self, step: int, points_mm: Floats) -> Floats:
-        """Return the standard deviations (point, 3), voxels, across the beam, vertical and along the beam."""
-        turn = directions(self.angle_rad[step])
-        turned = turn @ self.displacement_covariance(step, points_mm) @ turn.T
-        return np.asarray(np.sqrt(np.maximum(np.einsum("pii->pi", turned), 0)))
+        """Return the standard deviations (point, 3), voxels, across the beam, vertical and along the beam.
+
+        At points (point, 3) in mm of the current configuration; from noise and prior.
+        """
+        return turned_std(self.basis, self._step_covariance(step), float(self.angle_rad[step]), points_mm)
 
     def strain_std(self, step: int, height_mm: Floats) -> Floats:
-        """Return the standard deviation (height - 1,) of the axial strain between points of the axis, without unit.
-
-        `height_mm` (height,) are current heights; the strain is that of the motion between neighbours.
-        """
-        points = np.zeros((len(height_mm), 3))
-        points[:, 2] = height_mm
-        vertical = self.basis.shapes(points)[:, 2].reshape(len(points), -1)
-        difference = np.diff(vertical, axis=0) * self.voxel_mm / np.diff(height_mm)[:, None]
-        variance = np.einsum("pi,ij,pj->p", difference, self._step_covariance(step), difference, optimize=True)
-        return np.asarray(np.sqrt(np.maximum(variance, 0)))
+        """Return the standard deviation (height - 1,) of the axial strain between current heights on the axis."""
+        return strain_std(self.basis, self._step_covariance(step), height_mm, self.voxel_mm)
 
     def _step_covariance(self, step: int) -> Floats:
         if not self.time_functions[:, step].any():  # nothing was measured at this step
@@ -166,6 +154,28 @@ def step_covariance(covariance: Floats, time_functions: Floats, step: int) -> Fl
     functions = len(sigma)
     blocks = covariance.reshape(functions, -1, functions, len(covariance) // functions)
     return np.asarray(np.einsum("f,fngm,g->nm", sigma, blocks, sigma, optimize=True))
+
+
+def turned_std(basis: SectionBasis, covariance: Floats, angle_rad: float, points_mm: Floats) -> Floats:
+    """Return the standard deviations of u (point, 3), voxels, across the beam, vertical and along the beam.
+
+    `covariance` (section * motion, the same), voxel^2, is that of one step's amplitudes; `points_mm` (point, 3).
+    """
+    shapes = (directions(angle_rad) @ basis.shapes(points_mm).reshape(len(points_mm), 3, -1)).reshape(
+        3 * len(points_mm), -1
+    )
+    variance = ((shapes @ covariance) * shapes).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0)).reshape(-1, 3))
+
+
+def strain_std(basis: SectionBasis, covariance: Floats, height_mm: Floats, voxel_mm: float) -> Floats:
+    """Return the standard deviation (height - 1,) of the strain between heights on the axis, without unit."""
+    points = np.zeros((len(height_mm), 3))
+    points[:, 2] = height_mm
+    vertical = basis.shapes(points)[:, 2].reshape(len(points), -1)
+    difference = np.diff(vertical, axis=0) * voxel_mm / np.diff(height_mm)[:, None]
+    variance = ((difference @ covariance) * difference).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0)))
 
 
 def directions(angle_rad: ArrayLike) -> Floats:

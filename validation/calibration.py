@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from pdvc.measurement import Measurement
+from pdvc.sections import SectionBasis
 from validation.axis import TruePoints, axis_history, current_positions
 
 Floats = NDArray[np.float64]
@@ -84,30 +85,27 @@ def calibration(measurement: Measurement, truth: TruePoints, errors: Floats) -> 
     )
 
 
-def true_coefficients(measurement: Measurement, truth: TruePoints) -> tuple[Floats, Floats]:
+def true_coefficients(
+    basis: SectionBasis, time_functions: Floats, voxel_mm: float, truth: TruePoints
+) -> tuple[Floats, Floats]:
     """Return the coefficients (function, section, motion), voxels, nearest to the true motion.
 
-    Also the rms distance (3,) in x, y, z, voxels, of what they make from the true motion at the scored points: zero
-    where the motion is in the basis' span.
+    Also the rms distance (3,) in x, y, z, voxels, of what they make from the true motion, at the points between the
+    lowest and the highest section: zero where the motion is in the basis' span.
     """
-    basis, positions = measurement.basis, current_positions(truth)
-    low, high = basis.height_mm[[0, -1]]
-    steps = len(positions)
-    amplitude = np.empty((steps, *basis.shape))
-    for step, x in enumerate(positions):
-        inside = (x[:, 2] >= low) & (x[:, 2] <= high)
-        shapes = basis.shapes(x[inside]).reshape(int(inside.sum()) * 3, -1)
-        moved = truth.displacement_mm[step, inside].ravel() / measurement.voxel_mm
-        amplitude[step] = np.linalg.lstsq(shapes, moved, rcond=1e-9)[0].reshape(basis.shape)
-    functions = measurement.time_functions
-    norm = (functions**2).sum(axis=1)
-    coefficients = np.einsum("ft,tjk->fjk", functions, amplitude) / norm[:, None, None]
-    made = np.einsum("ft,fjk->tjk", functions, coefficients)
-    missed = []
-    for step, x in enumerate(positions):
-        inside = (x[:, 2] >= low) & (x[:, 2] <= high)
-        true = truth.displacement_mm[step, inside] / measurement.voxel_mm
-        missed.append(basis.displacement(made[step], x[inside]) - true)
+    positions, true = current_positions(truth), truth.displacement_mm / voxel_mm
+    inside = (positions[..., 2] >= basis.height_mm[0]) & (positions[..., 2] <= basis.height_mm[-1])
+    amplitude = np.empty((len(positions), *basis.shape))
+    for step, (x, here) in enumerate(zip(positions, inside, strict=True)):
+        shapes = basis.shapes(x[here]).reshape(3 * int(here.sum()), -1)
+        amplitude[step] = np.linalg.lstsq(shapes, true[step, here].ravel(), rcond=1e-9)[0].reshape(basis.shape)
+    norm = (time_functions**2).sum(axis=1)
+    coefficients = np.einsum("ft,tjk->fjk", time_functions, amplitude) / norm[:, None, None]
+    made = np.einsum("ft,fjk->tjk", time_functions, coefficients)
+    missed = [
+        basis.displacement(made[t], x[here]) - true[t, here]
+        for t, (x, here) in enumerate(zip(positions, inside, strict=True))
+    ]
     return coefficients, np.sqrt((np.concatenate(missed) ** 2).mean(axis=0))
 
 
@@ -116,7 +114,7 @@ def _nees(measurement: Measurement, truth: TruePoints) -> tuple[float, int]:
     functions = measurement.time_functions
     if measurement.covariance.ndim != 2:
         return math.nan, 0
-    true, _ = true_coefficients(measurement, truth)
+    true, _ = true_coefficients(measurement.basis, functions, measurement.voxel_mm, truth)
     norm = (functions**2).sum(axis=1)[:, None, None]
     known = np.nan_to_num(measurement.amplitude)
     error = np.einsum("ft,tjk->fjk", functions, known) / norm - true

@@ -3,6 +3,7 @@
 Trials share through a folder, by content:
 
 - ``clean/``: noise-free radiographs (`simulator.clean`), for all trials that differ in noise or in how they measure;
+- ``bounds/``: the Cramer-Rao bound (`validation.bound`), for all repetitions;
 - ``volumes-KEY/``: outline and reconstructed volumes, for all trials with the same reference scan, counts and all,
   whose options ask for the same scales and the same beam hardening. (Measurements also leave the modes they found
   there, a few kB each.)
@@ -24,7 +25,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -44,6 +45,8 @@ from simulator.scenario import Scenario
 from simulator.truth import Truth, read_truth
 from simulator.views import Stack, stacks_of
 from validation.axis import axis_history
+from validation.bound import kept_bound
+from validation.calibration import Quantities
 from validation.runs import Part, Result, Scalar
 from validation.scores import Scores, point_errors, score
 
@@ -80,18 +83,25 @@ class Trial:
     @property
     def score_columns(self) -> Mapping[str, type]:
         """Return names and types of what `carry_out` finds."""
-        return score_columns()
+        return {**score_columns(), **{f"bound_{each.name}": float for each in fields(Quantities)}}
 
     def parts(self) -> tuple[Part, ...]:
-        """Return what other trials may share: clean stacks and volumes."""
-        return *clean_parts(self.scenario), Volumes(self.scenario, self.options)
+        """Return what other trials may share: clean stacks, volumes, and the bound of the scenario."""
+        return (
+            *clean_parts(self.scenario),
+            Volumes(self.scenario, self.options),
+            LeastError(self.scenario, self.options),
+        )
 
     def carry_out(self, shared: Path) -> Result:
         """Simulate, measure and score; raises ValueError where that cannot be done."""
         with simulated(self.scenario, shared) as (experiment, truth, simulate_s):
             work = shared / Volumes(self.scenario, self.options).name
             measurement = measure(experiment, self.options, work=work)
-            return result_of(measurement, truth, simulate_s=simulate_s)
+            result = result_of(measurement, truth, simulate_s=simulate_s)
+        least = LeastError(self.scenario, self.options).read(shared)
+        bound = {f"bound_{name}": value for name, value in asdict(least).items()}
+        return replace(result, scores={**result.scores, **bound})
 
 
 @dataclass(frozen=True)
@@ -143,6 +153,39 @@ class Volumes:
         """Simulate the reference scan, reconstruct it and keep the volumes, unless they are there."""
         with simulated(self.scenario, shared) as (experiment, _, _):
             keep_volumes(experiment, self.options, shared / self.name)
+
+
+_HOW_TO_SOLVE = {"rigid", "deformation", "weighting", "smooth_px", "subtract_systematic"}
+
+
+@dataclass(frozen=True)
+class LeastError:
+    """Name the bound of a scenario in the shared folder; a `validation.runs.Part`."""
+
+    scenario: Scenario
+    options: MeasureOptions
+
+    @cached_property
+    def name(self) -> str:
+        """Return its file: a digest of the clean stacks, the detector, and the options on which unknowns depend."""
+        digest = _digest(
+            *(part.name for part in clean_parts(self.scenario)),
+            self.scenario.detector.model_dump_json(),
+            self.options.model_dump_json(exclude=_HOW_TO_SOLVE),
+        )
+        return f"bounds/{digest}.json"
+
+    def needs(self) -> tuple[Part, ...]:
+        """Return the clean stacks."""
+        return clean_parts(self.scenario)
+
+    def make(self, shared: Path) -> None:
+        """Compute it unless it is there."""
+        self.read(shared)
+
+    def read(self, shared: Path) -> Quantities:
+        """Return the bound."""
+        return kept_bound(self.scenario, self.options, shared / self.name, shared / CLEAN)
 
 
 def clean_parts(scenario: Scenario) -> tuple[CleanStack, ...]:
