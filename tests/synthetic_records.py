@@ -90,6 +90,7 @@ def measurement(amplitude: Floats, *, unobserved: tuple[int, ...] = (), title: s
             stop_reason="the residual no longer decreases",
         )
 
+    functions = np.sqrt(steps) * np.linalg.qr(rng.normal(size=(steps, 7)))[0].T
     return Measurement(
         title=title,
         voxel_mm=VOXEL_MM,
@@ -99,10 +100,10 @@ def measurement(amplitude: Floats, *, unobserved: tuple[int, ...] = (), title: s
         force_N=250 + 500 * np.clip(np.arange(steps) / (steps - 1) * 2 - 1, 0, None),
         window=(10, 70, 6, 34),
         basis=SectionBasis(height_mm=HEIGHT_MM[:sections], radius_mm=0.6),
-        time_functions=np.linalg.qr(rng.normal(size=(steps, 7)))[0].T,
+        time_functions=functions,
         amplitude=amplitude,
         amplitude_std=np.full_like(amplitude, 0.02),
-        covariance=4e-4 / steps * np.eye(7 * sections * motions),
+        covariance=4e-4 / steps * np.eye(len(functions) * sections * motions),
         data_share=np.broadcast_to(np.linspace(0.2, 1, motions), amplitude.shape).copy(),
         observed=observed,
         stages=(stage("rigid", 5, 1), stage("deformation", 3, sections)),

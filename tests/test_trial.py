@@ -12,7 +12,7 @@ from pdvc.options import MeasureOptions, StageOptions
 from simulator.scenario import Scenario
 from tests.test_job import TINY
 from validation import trial as room
-from validation.trial import Trial, Volumes, clean_parts, score_columns
+from validation.trial import BOUND_COLUMNS, Trial, Volumes, clean_parts, score_columns
 
 FAST = {"rigid": (StageOptions(scale="coarse", most=2),), "deformation": (StageOptions(scale=1, most=2),)}
 
@@ -48,8 +48,9 @@ def test_sharing_changes_nothing(tmp_path):
 
 
 def self_consistent(result):
-    assert set(result.scores) == set(score_columns())
-    for name, kind in score_columns().items():
+    columns = {**score_columns(), **dict.fromkeys(BOUND_COLUMNS.values(), float)}
+    assert set(result.scores) == set(columns)
+    for name, kind in columns.items():
         assert isinstance(result.scores[name], kind), name
     rms = np.sqrt(np.nanmean(result.arrays["points"].astype(float) ** 2, axis=(0, 1)))
     for value, name in zip(rms, ("across_beam", "vertical", "along_beam"), strict=True):

@@ -51,6 +51,11 @@ from validation.runs import Part, Result, Scalar
 from validation.scores import Scores, point_errors, score
 
 CLEAN = "clean"
+BOUND_COLUMNS = {
+    each.name: f"bound_{each.name}" if each.name == "strain" else f"bound_voxel_{each.name}"
+    for each in fields(Quantities)
+}
+"""The column of each part of the bound."""
 _NOT_SCORES = ("scenario", "peak_memory_gib")
 """Fields of `Scores` that a row has elsewhere, or that belong to a process which does many runs."""
 
@@ -83,7 +88,7 @@ class Trial:
     @property
     def score_columns(self) -> Mapping[str, type]:
         """Return names and types of what `carry_out` finds."""
-        return {**score_columns(), **{f"bound_{each.name}": float for each in fields(Quantities)}}
+        return {**score_columns(), **dict.fromkeys(BOUND_COLUMNS.values(), float)}
 
     def parts(self) -> tuple[Part, ...]:
         """Return what other trials may share: clean stacks, volumes, and the bound of the scenario."""
@@ -99,9 +104,8 @@ class Trial:
             work = shared / Volumes(self.scenario, self.options).name
             measurement = measure(experiment, self.options, work=work)
             result = result_of(measurement, truth, simulate_s=simulate_s)
-        least = LeastError(self.scenario, self.options).read(shared)
-        bound = {f"bound_{name}": value for name, value in asdict(least).items()}
-        return replace(result, scores={**result.scores, **bound})
+        least = asdict(LeastError(self.scenario, self.options).read(shared))
+        return replace(result, scores={**result.scores, **{BOUND_COLUMNS[name]: least[name] for name in least}})
 
 
 @dataclass(frozen=True)
