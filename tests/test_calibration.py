@@ -1,0 +1,144 @@
+"""Uncertainties against errors drawn from them, and the Cramer-Rao bound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from pdvc.experiment import read_experiment
+from pdvc.measure import measure
+from pdvc.measurement import Measurement
+from pdvc.options import MeasureOptions
+from simulator.scanner import simulate
+from tests import synthetic_records as records
+from tests.test_trial import trial
+from validation.bound import bound_of
+from validation.calibration import calibration, true_coefficients
+from validation.scores import point_errors
+
+SECTIONS, MOTIONS, FUNCTIONS = 4, 6, 3
+
+
+@dataclass(frozen=True)
+class Moved:
+    point_mm: np.ndarray
+    displacement_mm: np.ndarray
+
+
+def known_motion(rng: np.random.Generator) -> Measurement:
+    """Return a measurement that is exactly right, with a covariance that joins everything."""
+    record = records.measurement(np.zeros((records.STEPS, SECTIONS, MOTIONS)))
+    functions = record.time_functions[:FUNCTIONS]
+    coefficients = rng.normal(size=(FUNCTIONS, SECTIONS, MOTIONS))
+    size = FUNCTIONS * SECTIONS * MOTIONS
+    root = 0.02 * rng.normal(size=(size, size)) / np.sqrt(size) + 0.01 * np.eye(size)
+    return replace(
+        record,
+        time_functions=functions,
+        amplitude=np.einsum("ft,fjk->tjk", functions, coefficients),
+        covariance=root @ root.T,
+        observed=np.ones(SECTIONS, dtype=bool),
+    )
+
+
+def truth_of(measurement: Measurement) -> Moved:
+    """Return material points that move as measured: U(X) = u(X + U), by iteration."""
+    low, high = measurement.basis.height_mm[[0, -1]]
+    level = np.linspace(low + 0.1, high - 0.1, 12)
+    place = np.array([[0, 0], [-0.3, -0.2], [0.3, -0.2], [0.3, 0.2], [-0.3, 0.2]])
+    points = np.array([[x, y, z] for z in level for x, y in place])
+    moved = np.zeros((len(measurement.angle_rad), *points.shape))
+    for step in range(len(moved)):
+        for _ in range(40):
+            moved[step] = measurement.displacement(step, points + moved[step]) * measurement.voxel_mm
+    return Moved(points, moved)
+
+
+def drawn(measurement: Measurement, rng: np.random.Generator) -> Measurement:
+    """Return the measurement with an error of the covariance that it claims."""
+    error = np.linalg.cholesky(measurement.covariance) @ rng.normal(size=len(measurement.covariance))
+    error = error.reshape(-1, *measurement.amplitude.shape[1:])
+    return replace(
+        measurement, amplitude=measurement.amplitude + np.einsum("ft,fjk->tjk", measurement.time_functions, error)
+    )
+
+
+def test_coefficients_of_a_motion_inside_the_span_are_found_exactly():
+    exact = known_motion(np.random.default_rng(1))
+    found, missed = true_coefficients(exact.basis, exact.time_functions, exact.voxel_mm, truth_of(exact))
+    norm = (exact.time_functions**2).sum(axis=1)[:, None, None]
+    np.testing.assert_allclose(
+        found, np.einsum("ft,tjk->fjk", exact.time_functions, exact.amplitude) / norm, atol=1e-6
+    )
+    assert missed.max() < 1e-6
+
+
+def test_a_motion_outside_the_span_is_told_by_how_much_it_is_missed():
+    exact = known_motion(np.random.default_rng(1))
+    truth = truth_of(exact)
+    # a wave in time that three smooth functions do not hold
+    wave = 0.3 * (-1.0) ** np.arange(len(truth.displacement_mm))
+    truth.displacement_mm[..., 2] += wave[:, None] * exact.voxel_mm
+    _, missed = true_coefficients(exact.basis, exact.time_functions, exact.voxel_mm, truth)
+    held = np.linalg.norm(exact.time_functions @ wave) / np.sqrt(len(wave)) / np.linalg.norm(wave)
+    assert 0.3 * np.sqrt(1 - held**2) * 0.95 < missed[2] < 0.3
+
+
+def test_errors_drawn_from_the_covariance_are_covered_as_they_should_be():
+    rng = np.random.default_rng(7)
+    exact = known_motion(rng)
+    truth = truth_of(exact)
+    found = []
+    for _ in range(60):
+        one = drawn(exact, rng)
+        found.append(calibration(one, truth, point_errors(one, truth).components))
+    for level, part in ((0.5, "coverage_50"), (0.9, "coverage_90"), (0.95, "coverage_95")):
+        for name in ("across_beam", "vertical", "along_beam", "strain"):
+            each = np.array([getattr(getattr(one, part), name) for one in found])
+            # means over draws, which are independent; errors within a draw are not
+            assert abs(each.mean() - level) < 4 * each.std() / np.sqrt(len(each)) + 0.005, (part, name)
+    unknowns = FUNCTIONS * SECTIONS * MOTIONS
+    assert {one.nees_unknowns for one in found} == {unknowns}
+    # chi-square with so many degrees of freedom has variance twice their number
+    assert np.mean([one.nees for one in found]) == pytest.approx(unknowns, abs=4 * np.sqrt(2 * unknowns / 60))
+
+
+def test_an_interval_half_as_wide_as_due_shows():
+    rng = np.random.default_rng(8)
+    exact = known_motion(rng)
+    truth = truth_of(exact)
+    bold = [replace(drawn(exact, rng), covariance=exact.covariance / 4) for _ in range(20)]
+    found = [calibration(one, truth, point_errors(one, truth).components) for one in bold]
+    assert np.sqrt(np.mean([one.z_rms.vertical**2 for one in found])) == pytest.approx(2, rel=0.2)
+    assert np.mean([one.coverage_95.vertical for one in found]) < 0.8
+    assert np.mean([one.nees for one in found]) > 3 * FUNCTIONS * SECTIONS * MOTIONS
+
+
+def test_no_standard_deviation_that_is_predicted_is_below_the_bound(tmp_path):
+    """Cramer and Rao: reference views add noise, filters and weights lose information; nothing gains any."""
+    one = trial({"sections": 4})
+    clean = tmp_path / "clean"
+    bound, truth = bound_of(one.scenario, one.options, clean)
+    simulate(one.scenario, tmp_path / "experiment", clean=clean)
+    measured = measure(read_experiment(tmp_path / "experiment"), one.options)
+    np.testing.assert_allclose(measured.basis.height_mm, bound.basis.height_mm, rtol=1e-6)
+    predicted = calibration(measured, truth, point_errors(measured, truth).components).predicted
+    least = bound.quantities(truth)
+    for name in ("across_beam", "vertical", "strain"):
+        assert getattr(predicted, name) > getattr(least, name), name
+
+
+def test_the_bound_falls_with_the_root_of_frames(tmp_path):
+    one = trial({"sections": 4})
+    more = one.scenario.model_copy(
+        update={"detector": one.scenario.detector.model_copy(update={"frames": 4 * one.scenario.detector.frames})}
+    )
+    loose = MeasureOptions(**{**dict(one.options), "prior_voxel": 1e4})
+    once, truth = bound_of(one.scenario, loose, tmp_path)
+    fourfold, _ = bound_of(more, loose, tmp_path)
+    np.testing.assert_allclose(
+        fourfold.quantities(truth).across_beam, once.quantities(truth).across_beam / 2, rtol=1e-3
+    )
+    np.testing.assert_allclose(fourfold.quantities(truth).vertical, once.quantities(truth).vertical / 2, rtol=1e-3)
