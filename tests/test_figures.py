@@ -107,3 +107,17 @@ def test_steps_measured_alone_are_drawn_as_dots_and_steps_in_a_row_as_a_line():
         _, (ax,) = figures.new_figure(7, 3)
         figures.draw_errors(np.broadcast_to(by_step, (6, 3)), ax)
         assert {line.get_marker() for line in ax.lines} <= {marker, marker.lower()}
+
+
+def test_the_noise_floor_is_drawn_beside_the_true_scatter_where_there_is_one():
+    levels, scatter = np.linspace(-3, 3, 9), np.arange(27.0).reshape(9, 3)
+    _, (ax,) = figures.new_figure(7, 3)
+    figures.draw_noise_floor(levels, scatter, levels[::2], 2 * scatter[::2], ax)
+    solid, dashed = ax.lines[0:6:2], ax.lines[1:6:2]
+    for k in range(3):
+        np.testing.assert_array_equal(solid[k].get_ydata(), scatter[:, k])
+        np.testing.assert_array_equal(dashed[k].get_ydata(), 2 * scatter[::2, k])
+        assert solid[k].get_color() == dashed[k].get_color()
+    _, (ax,) = figures.new_figure(7, 3)
+    figures.draw_noise_floor(levels, scatter, None, None, ax)
+    assert len(ax.lines) == 3

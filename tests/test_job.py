@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
+import numpy as np
 import pytest
 
 from tests.command_line import only_line, pdvc_bench
@@ -55,8 +57,22 @@ def test_the_job_writes_all_it_promises(job):
     assert "error across beam" in result.stdout
     for name in ("experiment/experiment.toml", "measurement.nc", "scores.json", "report.html"):
         assert (out / name).is_file()
-    assert len(list((out / "figures").glob("*.png"))) == 10
+    assert len(list((out / "figures").glob("*.png"))) == 11
     assert not list(out.rglob("*.partial"))
+
+
+def test_the_report_tells_the_noise_floor_beside_the_true_error(job):
+    folder, _ = job
+    page = (folder / "out" / "report.html").read_text()
+    table = page.partition('<table id="noise-floor">')[2].partition("</table>")[0]
+    rows = [re.findall(r"<td>([^<]*)</td>", line) for line in table.splitlines() if "<td>" in line]
+    assert [row[0].partition(" ")[0] for row in rows] == ["scatter", "scatter", "true", "true", "true"]
+    values = np.array([row[1:] for row in rows], dtype=float)
+    assert (values > 0).all()
+    # over the whole test the same numbers as in the scores
+    scores = json.loads((folder / "out" / "scores.json").read_text())["error_voxel"]
+    assert values[4] == pytest.approx([scores[k] for k in ("across_beam", "vertical", "along_beam")], abs=1e-4)
+    assert "over the first 11 steps" in page
 
 
 def test_scores_are_complete_and_plausible(job):
@@ -105,7 +121,7 @@ def test_score_and_report_alone_agree_with_the_run(job):
         assert alone[key] == together[key]
     result = pdvc_bench("report", *arguments, "-o", folder / "page")
     assert result.exit_code == 0, result.stderr
-    assert len(list((folder / "page" / "figures").glob("*.png"))) == 10
+    assert len(list((folder / "page" / "figures").glob("*.png"))) == 11
 
 
 def test_a_truncated_stack_is_named(job):

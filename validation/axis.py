@@ -106,7 +106,7 @@ def axis_history(
     """
     if truth is None:
         return _at_sections(measurement)
-    chosen = _points_on_axis(truth.point_mm, _section_spacing(measurement) if spacing_mm is None else spacing_mm)
+    chosen = points_on_axis(truth.point_mm, _section_spacing(measurement) if spacing_mm is None else spacing_mm)
     true = truth.displacement_mm[:, chosen]
     measured = measured_at(measurement, truth.point_mm[chosen][None] + true)
     return AxisHistory(
@@ -134,7 +134,7 @@ def _section_spacing(measurement: Measurement) -> float:
     return float(np.mean(np.diff(height))) if len(height) > 1 else 0.0
 
 
-def _points_on_axis(point_mm: Floats, spacing_mm: float) -> NDArray[np.intp]:
+def points_on_axis(point_mm: Floats, spacing_mm: float) -> NDArray[np.intp]:
     """Return the points nearest the axis, from the bottom up, levels about `spacing_mm` apart."""
     from_axis = np.hypot(point_mm[:, 0], point_mm[:, 1])
     order = np.lexsort((from_axis, np.round(point_mm[:, 2], 6)))

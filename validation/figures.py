@@ -160,6 +160,22 @@ def draw_errors(by_step: Floats, ax: Axes) -> Axes:
     return _tidy(ax)
 
 
+def draw_noise_floor(level_mm: Floats, scatter: Floats, true_mm: Floats | None, true: Floats | None, ax: Axes) -> Axes:
+    """Draw the scatter (level, direction), voxels, over the height, beside the true one at its own levels."""
+    names = ("across the beam", "vertical", "along the beam")
+    dashed: dict[str, Any] = {"linewidth": 1.0, "linestyle": (0, (4, 2))}
+    for k, (name, colour) in enumerate(zip(names, (BLUE, GREEN, VERMILION), strict=True)):
+        ax.plot(level_mm, scatter[:, k], color=colour, linewidth=1.6, label=name)
+        if true is not None and true_mm is not None:
+            ax.plot(true_mm, true[:, k], color=colour, **dashed)
+    if true is not None:
+        ax.plot([], [], color="black", label="of the true error", **dashed)
+    ax.set(xlabel="height (mm)", ylabel="scatter over steps (voxel)")
+    ax.set_ylim(bottom=0)
+    ax.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return _tidy(ax)
+
+
 def draw_maps(
     level_edges_mm: Floats,
     measured: Floats,

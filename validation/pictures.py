@@ -15,6 +15,7 @@ from pdvc.measurement import Measurement
 from pdvc.radiographs import calibrate, grey_levels
 from validation import figures as draw
 from validation.axis import AxisHistory, TruePoints, axis_history, nan_mean
+from validation.noise_floor import NoiseFloor, noise_floor
 from validation.scores import point_errors
 
 SHOWN = (90 / 127, 110 / 127, 123 / 127)
@@ -41,6 +42,9 @@ def pictures(measurement: Measurement, experiment: Experiment | None, truth: Tru
     result += [_translations(axis), _snr(measurement), *_maps(axis)]
     if truth is not None:
         result.append(_errors(measurement, truth))
+    floor = noise_floor(measurement, truth)
+    if floor is not None:
+        result.append(_noise_floor(floor))
     return result
 
 
@@ -184,6 +188,25 @@ def _errors(measurement: Measurement, truth: TruePoints) -> Picture:
             else " What one radiograph hardly shows, the motion along its beam, is known through the steps seen from "
             "other sides."
         ),
+        figure=figure,
+    )
+
+
+def _noise_floor(floor: NoiseFloor) -> Picture:
+    figure, (ax,) = draw.new_figure(8.5, 3.2)
+    true = floor.true
+    draw.draw_noise_floor(
+        floor.level_mm,
+        floor.temporal_by_level,
+        None if true is None else true.level_mm,
+        None if true is None else true.scatter_by_level,
+        ax,
+    )
+    return Picture(
+        name="noise_floor",
+        caption="Noise floor: scatter of the measured motion beyond a rigid one, over the first "
+        f"{floor.steps} steps, at constant load."
+        + ("" if true is None else " Dashed: the scatter of the true error, rigid motion included."),
         figure=figure,
     )
 

@@ -13,8 +13,9 @@ import numpy as np
 from pdvc.experiment import Experiment
 from pdvc.measurement import Measurement
 from validation.axis import TruePoints, axis_history, nan_mean
+from validation.noise_floor import LEAST_STEPS, NoiseFloor, noise_floor
 from validation.pictures import of_volumes, pictures
-from validation.scores import Scores, mean_snr, modes_found
+from validation.scores import Directions, Scores, mean_snr, modes_found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +48,15 @@ def write_report(
         shown.append({"name": picture.name, "caption": picture.caption, "data": data})
     page = folder / "report.html"
     partial = page.with_name(page.name + ".partial")
-    partial.write_text(_page(measurement, scores, shown), encoding="utf-8")
+    partial.write_text(_page(measurement, truth, scores, shown), encoding="utf-8")
     partial.replace(page)
     return page
 
 
-def _page(measurement: Measurement, scores: Scores | None, shown: list[dict[str, str]]) -> str:
+def _page(
+    measurement: Measurement, truth: TruePoints | None, scores: Scores | None, shown: list[dict[str, str]]
+) -> str:
+    floor = noise_floor(measurement, truth)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("validation"),
         autoescape=True,
@@ -69,6 +73,9 @@ def _page(measurement: Measurement, scores: Scores | None, shown: list[dict[str,
         rows=summary_rows(measurement, scores),
         errors=_error_table(scores, measurement.voxel_mm * 1e3) if scores else [],
         pictures=shown,
+        floor=floor,
+        floor_lines=_floor_table(floor, scores) if floor else [],
+        least_steps=LEAST_STEPS,
         motions=_observability(measurement),
         unobserved=[f"{z:.2f}" for z in measurement.basis.height_mm[~measurement.observed]],
         voxel_um=f"{measurement.voxel_mm * 1e3:.2f}",
@@ -114,6 +121,25 @@ def _error_table(scores: Scores, voxel_um: float) -> list[list[str]]:
             _number(getattr(scores.random_voxel, key), 4),
         ]
         for key in ("across_beam", "vertical", "along_beam")
+    ]
+
+
+def _floor_table(floor: NoiseFloor, scores: Scores | None) -> list[list[str]]:
+    """Return a line for each number of the noise floor, and of the true error beside it, voxels."""
+    lines: list[tuple[str, Directions]] = [
+        ("scatter over the steps (temporal)", floor.temporal_voxel),
+        ("scatter over the points (spatial)", floor.spatial_voxel),
+    ]
+    if floor.true is not None:
+        lines += [
+            ("true error, scatter over the same steps", floor.true.scatter_voxel),
+            ("true error over the same steps, rms", floor.true.rms_voxel),
+        ]
+    if scores is not None:
+        lines.append(("true error over the whole test, rms", scores.error_voxel))
+    return [
+        [name, _number(part.across_beam, 4), _number(part.vertical, 4), _number(part.along_beam, 4)]
+        for name, part in lines
     ]
 
 
