@@ -22,7 +22,9 @@ def motion(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("command", ["scenarios", "options", "simulate", "measure", "score", "report", "run"])
+@pytest.mark.parametrize(
+    "command", ["scenarios", "options", "simulate", "measure", "score", "report", "run", "studies", "study"]
+)
 def test_every_command_explains_itself(command):
     assert command in pdvc_bench("--help").stdout
     result = pdvc_bench(command, "--help")

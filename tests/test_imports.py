@@ -31,7 +31,7 @@ def test_the_simulator_may_import_these_of_pdvc_and_nothing_else():
 
 
 def test_the_command_line_starts_without_loading_numerics():
-    heavy = ("numpy", "numba", "matplotlib", "xarray")
+    heavy = ("numpy", "numba", "matplotlib", "xarray", "pandas", "pyarrow", "distributed")
     code = f"import sys, validation.cli; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -25,7 +25,8 @@ app = typer.Typer(
     help="""Measure the motion of a sample from one radiograph per load step (P-DVC), and know how far to trust it.
 
     A **scenario** describes an experiment whose truth is known; **simulate** carries it out; **measure**
-    recovers the motion from the radiographs alone; **score** compares both; **run** does all in turn.
+    recovers the motion from the radiographs alone; **score** compares both; **run** does all in turn. A
+    **study** runs many and varies what they have.
 
     Start with:  `pdvc-bench run quick -o out/quick`
 
@@ -319,6 +320,71 @@ def compare(
         page = do(comparison, out, scheduler=scheduler, workers=workers, progress=progress)
     print((out / "methods.md").read_text(encoding="utf-8"), end="")
     _tell(f"comparison: {page}")
+
+
+@app.command()
+def studies(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[STUDY]", help="Print this one as TOML, to start your own from.")
+    ] = None,
+) -> None:
+    """List the built-in studies, or print one as TOML.
+
+    Example:  `pdvc-bench studies noise > mine.toml`
+    """
+    with _answering():
+        from validation.study import Study, builtin_studies, study_file
+
+        if name is not None:
+            Study.read(study_file(name))
+            print(study_file(name).read_text(encoding="utf-8"), end="")
+            return
+        from rich.console import Console
+
+        from validation.console import study_table
+
+        Console().print(study_table(Study.read(study_file(each)) for each in builtin_studies()))
+
+
+@app.command()
+def study(
+    study: Annotated[
+        str, typer.Argument(metavar="STUDY", help="A built-in name (see: studies), or the path of a TOML file.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Simulate and measure many experiments that differ in chosen factors, and show how the error depends on these.
+
+    Writes a row for each run as soon as it is finished, and at the end DIR/table.parquet, summary.csv, figures/ and
+    study.html. Interrupted or killed, it goes on where it was when the same command is given again.
+
+    Example:  `pdvc-bench study noise -o out/noise`
+    """
+    with _answering(resume="give the same command again to go on from here") as progress:
+        from validation.runs import run_trials
+        from validation.study import Study, study_file, trials_of
+        from validation.study_report import machine, write_study_report
+
+        path = study_file(study)
+        chosen = Study.read(path)
+        trials = trials_of(chosen, path)
+        if scheduler is not None and workers is not None:
+            raise ValueError("--workers: expected without --scheduler, which has its own workers")
+        table = run_trials(trials, out, scheduler=scheduler, workers=workers, progress=progress)
+        page, summary = write_study_report(
+            out, chosen, path.read_text(encoding="utf-8"), table, where=machine(scheduler, workers)
+        )
+    from rich.console import Console
+
+    from validation.console import study_summary
+
+    Console().print(study_summary(chosen, summary))
+    failed = int((table["status"] != "done").sum())
+    if failed:
+        _tell(f"{failed} of {len(table)} runs failed: see the reasons in {page}, or {out / 'failed'}")
+    _tell(f"report: {page}")
 
 
 def _read_truth(folder: Path) -> Truth:

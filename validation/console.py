@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -26,7 +27,10 @@ from rich.table import Table
 from validation.scores import Scores
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from simulator.scenario import Scenario
+    from validation.study import Study
 
 INTERRUPTED = 130
 WRONG_INPUT = 2
@@ -154,6 +158,37 @@ def summary(scores: Scores, report: Path | None = None) -> Table:
     if report is not None:
         table.caption = f"report: {report}"
         table.caption_justify = "left"
+    return table
+
+
+def study_summary(study: Study, summary: pd.DataFrame) -> Table:
+    """Return a study's errors as a table of one screen: bias and random part for each combination."""
+    title = f"{study.name}: bias / random part, voxel rms; of the strain, rms"
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for factor in study.factor:
+        table.add_column(factor.axis_label, justify="right")
+    quantities = ("voxel_across_beam", "voxel_vertical", "voxel_along_beam", "strain")
+    for name in ("runs", "across beam", "vertical", "along beam", "strain"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for _, row in summary.iterrows():
+        which = [row[factor.column] for factor in study.factor]
+        parts = [(row[f"bias_{quantity}"], row[f"random_{quantity}"]) for quantity in quantities]
+        table.add_row(
+            *(f"{each:g}" if isinstance(each, float) else str(each) for each in which),
+            str(int(row["runs"])),
+            *(f"{bias:.2g}/{random:.2g}" for bias, random in parts),
+        )
+    return table
+
+
+def study_table(studies: Iterable[Study]) -> Table:
+    """Return the studies as a table, one line each."""
+    table = Table(box=None, pad_edge=False)
+    for name in ("name", "runs", "scenario", "what it asks"):
+        table.add_column(name, justify="right" if name == "runs" else "left")
+    for each in studies:
+        counts = [len(factor.values) for factor in each.factor]
+        table.add_row(each.name, str(each.repetitions * math.prod(counts)), each.scenario, each.title)
     return table
 
 

@@ -172,7 +172,7 @@ def connected(scheduler: str | None, workers: int | None, scratch: Path) -> Iter
             processes=True,
             memory_limit=MEMORY_LIMIT // count,
             env=one_thread,
-            dashboard_address=None,
+            dashboard_address=":0",
             local_directory=str(scratch),
             silence_logs=logging.CRITICAL,
         ) as cluster,

@@ -1,0 +1,314 @@
+"""Studies as a user writes and runs them: designs, mistakes, a whole one, and one that is killed on the way."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from distributed import LocalCluster
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simulator.scenario import load_scenario
+from simulator.views import stream
+from tests.command_line import only_line, pdvc_bench
+from validation.runs import is_done
+from validation.study import Study, builtin_studies, combinations, study_file, trials_of
+
+SCENARIO = """
+name = "tiny"
+discarded_rows = 4
+[specimen]
+facet_mm = 0.12
+thinned = "both"
+[graphite]
+mean_diameter_mm = 0.4
+smallest_diameter_mm = 0.2
+largest_diameter_mm = 0.8
+[geometry]
+rows = 60
+columns = 30
+pixel_mm = 4.8
+[acquisition]
+reference_views = 30
+test_steps = 16
+steps_per_turn = 8
+subpixels = 2
+[loading]
+plateau_steps = 8
+stroke_mm_per_s = 0.01
+necking_strain = 0.0
+"""
+BASE = """
+name = "tiny"
+title = "Small enough for a test"
+scenario = "tiny.toml"
+repetitions = 2
+[change.options]
+section_motions = ["translation_x", "translation_y", "translation_z", "rotation_z"]
+time = [{ kind = "force" }, { kind = "angle" }, { kind = "polynomial" }]
+rigid = [{ solver = "gauss-newton", most = 2 }]
+deformation = [{ solver = "gauss-newton", most = 1 }]
+"""
+FACTORS = """
+[[factor]]
+key = "scenario.detector.photons_per_pixel"
+values = [500, 8000.0]
+log = true
+[[factor]]
+key = "options.sections"
+values = [3, 5]
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    (folder / "tiny.toml").write_text(SCENARIO)
+    (folder / "study.toml").write_text(text)
+    return folder / "study.toml"
+
+
+def trials(folder: Path, text: str):
+    path = written(folder, text)
+    return trials_of(Study.read(path), path)
+
+
+class TestDesigns:
+    def test_a_grid_takes_every_value_with_every_other_and_repeats(self, tmp_path):
+        found = trials(tmp_path, BASE + FACTORS)
+        assert [tuple(trial.columns.values()) for trial in found] == [
+            (photons, sections, 0, repetition)
+            for photons in (500.0, 8000.0)
+            for sections in (3, 5)
+            for repetition in range(2)
+        ]
+        for trial in found:
+            assert trial.scenario.detector.photons_per_pixel == trial.factors["photons_per_pixel"]
+            assert trial.options.sections == trial.factors["sections"]
+            assert trial.options.rigid[0].solver == "gauss-newton"
+            assert trial.scenario.geometry.rows == 60
+        assert len({trial.key for trial in found}) == 8
+
+    def test_a_list_takes_values_side_by_side(self, tmp_path):
+        found = trials(tmp_path, 'design = "list"\n' + BASE + FACTORS)
+        assert [tuple(trial.factors.values()) for trial in found[::2]] == [(500.0, 3), (8000.0, 5)]
+
+    def test_several_keys_may_change_together_under_a_name(self, tmp_path):
+        turns = """
+            [[factor]]
+            key = ["scenario.acquisition.test_steps", "scenario.acquisition.steps_per_turn", "options.time"]
+            values = [[16, 8, [{ kind = "force" }]], [24, 8, [{ kind = "polynomial", degree = 2 }]]]
+            name = "turns"
+            names = [2, 3]
+        """
+        first, *_, last = trials(tmp_path, BASE + turns)
+        assert (first.factors, last.factors) == ({"turns": 2}, {"turns": 3})
+        assert (first.scenario.acquisition.test_steps, last.scenario.acquisition.test_steps) == (16, 24)
+        assert (first.options.time[0].kind, last.options.time[0].kind) == ("force", "polynomial")
+
+    def test_values_of_several_types_become_text_in_the_table(self, tmp_path):
+        factor = '[[factor]]\nkey = "options.beam_hardening"\nvalues = ["fit", "none", [0.9, 0.1, 0.0]]\n'
+        found = trials(tmp_path, BASE + factor)
+        assert [trial.factors["beam_hardening"] for trial in found[::2]] == ["fit", "none", "[0.9, 0.1, 0.0]"]
+        assert found[-1].options.beam_hardening == (0.9, 0.1, 0.0)
+
+    def test_without_factors_the_base_is_repeated(self, tmp_path):
+        found = trials(tmp_path, BASE.replace("repetitions = 2", "repetitions = 5\nseed = 3"))
+        assert [dict(trial.columns) for trial in found] == [{"seed": 3, "repetition": r} for r in range(5)]
+
+    def test_the_same_repetition_has_the_same_noise_in_every_combination(self, tmp_path):
+        found = trials(tmp_path, BASE + FACTORS)
+        draws = [stream(trial.scenario, "test", 5).random() for trial in found]
+        assert draws == draws[:2] * 4
+        assert draws[0] != draws[1]
+
+    @settings(deadline=None, max_examples=30)
+    @given(st.integers(1, 40), st.integers(0, 5), st.integers(1, 3))
+    def test_a_latin_hypercube_meets_each_part_of_each_range_once(self, samples, seed, factors):
+        keys = [
+            "scenario.detector.photons_per_pixel",
+            "scenario.misalignment.lean_deg",
+            "scenario.xray.silicon_fraction",
+        ]
+        low, high = 10.0, 1e5
+        described = [{"key": key, "low": low, "high": high, "log": n == 0} for n, key in enumerate(keys[:factors])]
+        values = {"name": "x", "seed": seed, "design": "latin-hypercube", "samples": samples, "factor": described}
+        study = Study.parse(values, where="test")
+        base = {"scenario": load_scenario("small").model_dump(mode="json")}
+        points = np.array([list(each.factors.values()) for each in combinations(study, base)])
+        assert points.shape == (samples, factors)
+        share = (points - low) / (high - low)
+        share[:, 0] = np.log(points[:, 0] / low) / np.log(high / low)
+        np.testing.assert_array_equal(
+            np.sort(np.floor(share * samples), axis=0), np.arange(samples)[:, None] + 0 * share
+        )
+
+    def test_a_latin_hypercube_rounds_whole_numbers_and_takes_values_evenly(self, tmp_path):
+        text = 'design = "latin-hypercube"\nsamples = 6\n' + BASE
+        text += '[[factor]]\nkey = "options.sections"\nlow = 3\nhigh = 9\n'
+        text += '[[factor]]\nkey = "options.weighting"\nvalues = ["uniform", "noise"]\n'
+        found = trials(tmp_path, text)[::2]
+        assert all(isinstance(trial.options.sections, int) for trial in found)
+        assert sorted(trial.factors["weighting"] for trial in found) == ["noise"] * 3 + ["uniform"] * 3
+
+
+FACTOR = '[[factor]]\nkey = "scenario.detector.frames"\n'
+MISTAKES = {
+    "repetition = 3\n" + BASE: "study.toml: repetition: unknown key",
+    BASE + FACTOR + "values = [1, 0]": "detector.frames = 0: scenario: detector.frames: expected greater than",
+    BASE + FACTOR + 'values = ["many"]': "detector.frames: expected a valid integer, given 'many'",
+    BASE + FACTOR.replace("frames", "photons_per_pixl") + "values = [1.0]": (
+        "'scenario.detector.photons_per_pixl': unknown key; did you mean 'scenario.detector.photons_per_pixel'?"
+    ),
+    BASE + FACTOR.replace("scenario.", "") + "values = [1]": "unknown key; did you mean 'scenario.detector.frames'?",
+    BASE + FACTOR.replace("detector.frames", "repetition") + "values = [1]": "scenario.repetition is what",
+    BASE + FACTOR: "factor.0: expected either values, or low and high",
+    BASE + FACTOR + "low = 1\nhigh = 5": "values of factor frames, as only a Latin hypercube takes low and high",
+    BASE + FACTOR + "values = [1]\n" + FACTOR + "values = [2]": "expected another name for factor frames",
+    BASE + FACTOR + 'values = [1]\nname = "strain_rms"': "expected another name for factor strain_rms",
+    BASE + FACTOR + 'values = [1, 2]\nnames = ["one"]': "as many names as values, 2, got 1",
+    BASE + '[[factor]]\nkey = ["options.sections", "options.weighting"]\nvalues = [[1]]': "a list of 2, one for",
+    BASE + '[[factor]]\nkey = "options.discard_rows"\nvalues = [30]': "options.discard_rows = 30: options:",
+    'design = "list"\n' + BASE + FACTORS.replace("[3, 5]", "[3]"): "as many values of each factor in a list",
+    'design = "latin-hypercube"\n' + BASE + FACTORS: "expected samples for design = 'latin-hypercube'",
+    'design = "random"\n' + BASE: "design: expected 'grid', 'list' or 'latin-hypercube', given 'random'",
+    BASE.replace("[change.options]", "[change.option]"): "change.option: unknown key; did you mean 'options'?",
+    BASE + '[change.scenario.detector]\nframe = 3': "change.scenario.detector.frame: unknown key; did you mean",
+    BASE + '[change.scenario.detector]\nframes = 3.5': "scenario: detector.frames: expected a valid integer",
+    BASE.replace("tiny.toml", "none.toml"): "none.toml: expected a TOML file, found none",
+    BASE.replace('"tiny.toml"', '"smal"'): "given 'smal'; did you mean 'small'?",
+    'options = "papr"\n' + BASE: "papr: expected a TOML file, found none",
+    "name = \n": "study.toml: not valid TOML",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "answer"), MISTAKES.items())
+def test_a_mistake_is_answered_in_one_line_before_anything_is_done(tmp_path, text, answer):
+    path = written(tmp_path, text)
+    result = pdvc_bench("study", path, "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert answer in only_line(result)
+    assert str(tmp_path) in only_line(result) or "did you mean" in answer
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
+    result = pdvc_bench("study", "nois", "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "did you mean 'noise'?" in only_line(result)
+
+
+@pytest.mark.parametrize(("name", "runs"), [("noise", 80), ("views-per-turn", 60), ("sections", 60), ("coverage", 60)])
+def test_builtin_studies_are_valid_and_printed_as_they_are_written(name, runs):
+    assert name in builtin_studies()
+    path = study_file(name)
+    found = trials_of(Study.read(path), path)
+    assert len({trial.key for trial in found}) == len(found) == runs
+    assert pdvc_bench("studies", name).stdout == path.read_text()
+    assert f"{runs}" in next(line for line in pdvc_bench("studies").stdout.splitlines() if line.startswith(name))
+
+
+@pytest.fixture(scope="module")
+def address():
+    """Return the address of a scheduler whose one worker is this process, which has its kernels loaded."""
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0", silence_logs=logging.CRITICAL
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory, address):
+    """Carry out a study once; the tests below look at what it left."""
+    folder = tmp_path_factory.mktemp("study")
+    result = pdvc_bench("study", written(folder, BASE + FACTORS), "-o", folder / "out", "--scheduler", address)
+    assert result.exit_code == 0, result.stderr
+    return folder, result
+
+
+def comparable(folder: Path) -> pd.DataFrame:
+    table = pd.read_parquet(folder / "table.parquet")
+    return table[[name for name in table.columns if not name.startswith("seconds")]]
+
+
+class TestAWholeStudy:
+    def test_it_leaves_all_it_promises(self, undisturbed):
+        folder, result = undisturbed
+        out = folder / "out"
+        assert str(out / "study.html") in result.stderr
+        table = pd.read_parquet(out / "table.parquet")
+        assert len(table) == len(list((out / "runs").iterdir())) == len(list((out / "errors").iterdir())) == 8
+        assert set(table["status"]) == {"done"}
+        assert table["seconds"].min() > 0
+        assert {path.name for path in out.iterdir()} == {
+            *("runs", "errors", "failed", "figures", "table.parquet", "summary.csv", "scores.csv", "study.html"),
+        }
+        assert len(list((out / "figures").iterdir())) == 2
+        assert str(FACTORS.splitlines()[2]) in (out / "study.html").read_text().replace("&#34;", '"')
+
+    def test_more_photons_leave_less_random_error(self, undisturbed):
+        folder, _ = undisturbed
+        summary = pd.read_csv(folder / "out" / "summary.csv").set_index(["photons_per_pixel", "sections"])
+        for sections in (3, 5):
+            dark, bright = (summary.loc[(photons, sections), "random_voxel_across_beam"] for photons in (500, 8000))
+            assert 2 < dark / bright < 8  # 4 if photon noise were all
+
+    def test_asked_again_it_only_draws_anew(self, undisturbed, monkeypatch):
+        folder, _ = undisturbed
+        before = {path: path.stat().st_mtime_ns for path in (folder / "out" / "runs").iterdir()}
+        (folder / "out" / "study.html").unlink()
+        monkeypatch.setattr("validation.runs.connected", None)
+        monkeypatch.setattr("validation.study_report.study_pictures", lambda *_: [])
+        result = pdvc_bench("study", folder / "study.toml", "-o", folder / "out")
+        assert result.exit_code == 0, result.stderr
+        assert {path: path.stat().st_mtime_ns for path in (folder / "out" / "runs").iterdir()} == before
+        assert (folder / "out" / "study.html").exists()
+
+    def test_a_run_that_fails_is_a_row_and_the_rest_goes_on(self, address, tmp_path, monkeypatch):
+        monkeypatch.setattr("validation.study_report.study_pictures", lambda *_: [])
+        # a beam that makes less than a count is none
+        factor = """
+            [[factor]]
+            key = ["scenario.detector.counts_full", "scenario.detector.readout_noise_counts"]
+            values = [[40000.0, 30.0], [0.1, 0.0]]
+        """
+        text = BASE.replace("repetitions = 2", "repetitions = 1") + factor
+        result = pdvc_bench("study", written(tmp_path, text), "-o", tmp_path / "out", "--scheduler", address)
+        assert result.exit_code == 0, result.stderr
+        assert "1 of 2 runs failed" in result.stderr
+        table = pd.read_parquet(tmp_path / "out" / "table.parquet")
+        assert list(table["status"]) == ["done", "failed"]
+        assert table["reason"][1].startswith("ValueError: ")
+        assert np.isnan(table["error_voxel_vertical"][1])
+        assert table["reason"][1].partition(": ")[2] in (tmp_path / "out" / "study.html").read_text()
+
+
+def test_a_study_that_was_killed_goes_on_to_the_same_table(undisturbed, address, monkeypatch):
+    monkeypatch.setattr("validation.study_report.study_pictures", lambda *_: [])
+    folder, _ = undisturbed
+    out = folder / "killed"
+    command = [sys.executable, "-m", "validation.cli", "study", folder / "study.toml", "-o", out, "--workers", "1"]
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent.parent)}
+    process = subprocess.Popen(command, env=environment, start_new_session=True, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list((out / "runs").glob("*.parquet")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    path = folder / "study.toml"
+    done = [trial.key for trial in trials_of(Study.read(path), path) if is_done(out, trial)]
+    assert 1 <= len(done) < 8
+    assert not (out / "table.parquet").exists()
+    before = {key: (out / "runs" / f"{key}.parquet").stat().st_mtime_ns for key in done}
+    result = pdvc_bench("study", path, "-o", out, "--scheduler", address)
+    assert result.exit_code == 0, result.stderr
+    assert {key: (out / "runs" / f"{key}.parquet").stat().st_mtime_ns for key in done} == before
+    assert not (out / "work").exists()
+    pd.testing.assert_frame_equal(comparable(out), comparable(folder / "out"))
