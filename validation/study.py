@@ -33,7 +33,7 @@ from pdvc.options import PROTOCOLS, MeasureOptions, resolved
 from pdvc.settings import Settings, SettingsError
 from simulator.scenario import Scenario, load_scenario
 from validation.runs import Scalar
-from validation.trial import Trial, score_columns
+from validation.trial import BOUND_COLUMNS, Trial, score_columns
 
 _TAKEN = ("seed", "repetition", "status", "reason", "seconds", "version", "key", "runs", "failed")
 
@@ -136,7 +136,7 @@ class Study(Settings):
         lengths = {len(factor.values) for factor in self.factor}
         if self.design == "list" and len(lengths) > 1:
             raise ValueError(f"as many values of each factor in a list, got {sorted(lengths)}")
-        taken = [*_TAKEN, *score_columns()]
+        taken = [*_TAKEN, *score_columns(), *BOUND_COLUMNS.values()]
         for factor in self.factor:
             if factor.column in taken:
                 raise ValueError(f"another name for factor {factor.column}: a column of the table has it already")
