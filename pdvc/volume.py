@@ -139,13 +139,19 @@ def halved(volume: Volume) -> Volume:
     (c_i-1 + 23 c_i + 23 c_i+1 + c_i+2) / 48 (Unser, IEEE Signal Processing Magazine 16, 1999).
     """
     values = _continued(volume.values)
-    for axis in range(3):
+    for axis in (2, 1, 0):  # z last: then the largest array is laid out in order, and made only once
         known = np.moveaxis(values, axis, 0)
-        c = ndimage.spline_filter1d(known, 3, axis=0, output=np.float32, mode="mirror")
-        c = np.concatenate([c[1:2], c, c[-2:-1]])
+        c = np.empty((len(known) + 2, *known.shape[1:]), dtype=np.float32)
+        ndimage.spline_filter1d(known, 3, axis=0, output=c[1:-1], mode="mirror")
+        c[0], c[-1] = c[2], c[-3]
         fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=np.float32)
         fine[::2] = known
-        fine[1::2] = (np.float32(23) * (c[1:-2] + c[2:-1]) + c[:-3] + c[3:]) / np.float32(48)
+        between = fine[1::2]
+        np.add(c[1:-2], c[2:-1], out=between)
+        between *= 23
+        between += c[:-3]
+        between += c[3:]
+        between /= 48
         values = np.moveaxis(fine, 0, axis)
     values = framed(np.ascontiguousarray(values))
     nz, ny, nx = values.shape
