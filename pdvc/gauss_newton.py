@@ -45,12 +45,15 @@ def blocks_of(time_functions: Floats) -> tuple[Block, ...]:
     return tuple(Block(functions=own, steps=np.flatnonzero(used[own].any(axis=0))) for own in members)
 
 
-def hessian(equations: Equations, time_functions: Floats) -> Floats:
-    """Return H (function * unknown, function * unknown), with unknown = section * motion."""
+def hessian(matrices: Floats, time_functions: Floats) -> Floats:
+    """Return sum_t sigma sigma^T (x) B(t), from B (step, unknown, unknown) and sigma (function, step).
+
+    Of shape (function * unknown, function * unknown), with unknown = section * motion.
+    """
     functions, steps = time_functions.shape
-    size = equations.vector.shape[1]
+    size = matrices.shape[1]
     pairs = np.einsum("ft,gt->fgt", time_functions, time_functions).reshape(-1, steps)
-    blocks = (pairs @ equations.matrix.reshape(steps, -1)).reshape(functions, functions, size, size)
+    blocks = (pairs @ matrices.reshape(steps, -1)).reshape(functions, functions, size, size)
     return np.ascontiguousarray(blocks.transpose(0, 2, 1, 3)).reshape(functions * size, functions * size)
 
 
@@ -104,7 +107,7 @@ def _change(equations: Equations, time_functions: Floats, coefficients: Floats, 
     part = replace(equations, matrix=equations.matrix[block.steps], vector=equations.vector[block.steps])
     now = coefficients[block.functions]
     ridge = np.tile(prior.ridge(equations.rms), len(own))
-    matrix = hessian(part, own)
+    matrix = hessian(part.matrix, own)
     matrix[np.diag_indices_from(matrix)] += ridge
     vector = (own @ part.vector).ravel() - ridge * now.ravel()
     return solved(matrix, vector).reshape(now.shape)

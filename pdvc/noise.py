@@ -118,7 +118,7 @@ def propagate(
     unknowns = basis.shape[0] * basis.shape[1]
     pairs: dict[tuple[int, int], Floats] = {}
     static = np.zeros((len(time_functions), unknowns, unknowns)) if apart else None
-    pile = _Pile(noise.flat.shape, time_functions, basis.shape[1])
+    pile = Pile(noise.flat.shape, time_functions, basis.shape[1])
     tests = _Tests(noise_overlap(noise.smooth_px))
     users, last_use = _users(systematic)
     held: dict[int, Sensitivities] = {}
@@ -128,11 +128,11 @@ def propagate(
         """Add what the step's own noise and the flats' do; return Y, which its views' noise needs."""
         weight, image = images.weight[t % len(images.weight)], noise.step(t)
         own = replace(field, values=field.values * weight[..., None])
-        _add(pairs, (t, t), _product(own, own, image.variance, unknowns))
+        _add(pairs, (t, t), product(own, own, image.variance, unknowns))
         places = systematic.places(images.rays[t], basis, amplitude[t], images.voxel_mm)
         moved = _spread(own, places, noise.flat.shape)
         view = _between(noise, systematic, t)
-        here = pile if static is None else _Pile(noise.flat.shape, np.ones((1, len(amplitude))), basis.shape[1])
+        here = pile if static is None else Pile(noise.flat.shape, np.ones((1, len(amplitude))), basis.shape[1])
         here.add(t, moved, view.slope, (0, 0))
         here.add(t, own, -image.slope, systematic.corner)
         if static is not None:
@@ -151,7 +151,7 @@ def propagate(
             for other in users[view][: i + 1]:
                 if t == other or not apart:
                     share = _share(systematic, t, view) * _share(systematic, other, view)
-                    _add(pairs, (t, other), _product(held[t], held[other], share * variance, unknowns))
+                    _add(pairs, (t, other), product(held[t], held[other], share * variance, unknowns))
         for t in users[view]:
             if last_use[t] == view:
                 del held[t]
@@ -209,10 +209,11 @@ def _add(pairs: dict[tuple[int, int], Floats], key: tuple[int, int], block: Floa
     pairs[key] = pairs[key] + block if key in pairs else block
 
 
-def _product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns: int) -> Floats:
-    """Return sum_p one^T v other, (unknown, unknown); rows that touch the same sections are multiplied together."""
+def product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns: int) -> Floats:
+    """Return sum_p one(p)^T v(p) other(p), (unknown, unknown), of two fields with variances v (row, column)."""
     result = np.zeros((unknowns, unknowns))
     firsts = np.stack([one.first, other.first])
+    # rows that touch the same sections are multiplied together
     for a, b in np.unique(firsts, axis=1).T:
         rows = (firsts[0] == a) & (firsts[1] == b)
         left = (one.values[rows] * variance[rows][..., None]).reshape(-1, one.values.shape[2])
@@ -250,10 +251,11 @@ def _scaled(blocks: Floats, time_functions: Floats) -> Floats:
     return np.asarray(blocks * (time_functions**2).sum(axis=1)[:, None, None])
 
 
-class _Pile:
-    """Sum sigma(t) (x) the fields of all steps in each pixel of the detector: what is the same in all images."""
+class Pile:
+    """Sum z = sum_t sigma(t) (x) field(t) in each pixel of the detector: what a noise meets that all images share."""
 
     def __init__(self, shape: tuple[int, ...], time_functions: Floats, motions: int) -> None:
+        """Begin with nothing on a detector of `shape`, for time functions (function, step)."""
         self._shape = shape
         self._functions = time_functions.astype(np.float32)
         self._motions = motions

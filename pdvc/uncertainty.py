@@ -60,7 +60,7 @@ def posterior(equations: Equations, time_functions: Floats, prior: Prior, noise:
         noises = [gamma2 * matrix for matrix in matrices] if noise is None else list(noise)
         covariance = np.stack([sandwich(m, v, ridge, gamma2) for m, v in zip(matrices, noises, strict=True)])
     else:
-        matrix = hessian(equations, time_functions)
+        matrix = hessian(equations.matrix, time_functions)
         covariance = sandwich(
             matrix, gamma2 * matrix if noise is None else noise, np.tile(ridge, len(time_functions)), gamma2
         )

@@ -385,7 +385,7 @@ def test_more_steps_never_lower_the_information(case, believed, noise, data):
     few = sorted(data.draw(st.sets(st.sampled_from(steps), min_size=1, max_size=len(steps) - 1)))
     whole, functions = case.equations(0 * case.amplitude), case.time_functions
     part = part_of(whole, few)
-    more, less = gauss_newton.hessian(whole, functions), gauss_newton.hessian(part, functions[:, few])
+    more, less = gauss_newton.hessian(whole.matrix, functions), gauss_newton.hessian(part.matrix, functions[:, few])
     eigenvalues = np.linalg.eigvalsh(more - less)
     assert eigenvalues.min() > -1e-9 * eigenvalues.max()
     assert eigenvalues.max() > 0

@@ -89,7 +89,7 @@ def test_the_hessian_is_the_sum_of_kronecker_products(seed):
     expected = sum(
         np.kron(np.outer(functions[:, t], functions[:, t]), equations.matrix[t]) for t in range(functions.shape[1])
     )
-    np.testing.assert_allclose(gauss_newton.hessian(equations, functions), expected, rtol=1e-10, atol=1e-8)
+    np.testing.assert_allclose(gauss_newton.hessian(equations.matrix, functions), expected, rtol=1e-10, atol=1e-8)
 
 
 @given(st.integers(0, 10**6), st.floats(0.05, 10.0))

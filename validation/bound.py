@@ -143,7 +143,7 @@ def _inverse(
         first = [int(np.argmax(f != 0)) for f in time_functions]
         matrices = [f[t] ** 2 * equations.matrix[t] for t, f in zip(first, time_functions, strict=True)]
         return np.stack([solved(m + np.eye(size) / prior_voxel**2, np.eye(size)) for m in matrices])
-    matrix = hessian(equations, time_functions)
+    matrix = hessian(equations.matrix, time_functions)
     return solved(matrix + np.eye(len(matrix)) / prior_voxel**2, np.eye(len(matrix)))
 
 

@@ -387,6 +387,42 @@ def study(
     _tell(f"report: {page}")
 
 
+@app.command()
+def plan(
+    scenario: ScenarioName,
+    options: Options = "default",
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="CSV", help="Write the designs here, too, as a table.")
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Tell what to expect of a test before it is made, and which motions it would not show.
+
+    From the reference scan's sensitivities alone: the standard deviations of the scenario as it is, and with other
+    numbers of radiographs a turn, turns, frames, flats and sections. They hold noise and prior, not model errors.
+
+    Example:  `pdvc-bench plan quick`
+    """
+    with _answering() as progress:
+        from simulator.scenario import load_scenario
+        from validation.plan import plan as work_out
+        from validation.plan_tables import designs_csv, designs_table, weak_table
+        from validation.run import write_text
+
+        chosen, read = load_scenario(scenario), _read_options(options)
+        _use_threads(threads)
+        found = work_out(chosen, read, progress=progress)
+        if out is not None:
+            write_text(out, designs_csv(found))
+    from rich.console import Console
+
+    console = Console()
+    console.print(designs_table(found, chosen))
+    console.print(weak_table(found))
+    if out is not None:
+        _tell(f"table: {out}")
+
+
 def _read_truth(folder: Path) -> Truth:
     from simulator.truth import read_truth
 
