@@ -23,7 +23,7 @@ from pdvc.volume_correlation import correlate
 
 GROUP = "pdvc_bench.methods"
 """The entry-point group in which methods are looked for."""
-OWN = ("pgd", "gauss-newton", "weighted", "each-step", "classical-dvc")
+OWN = ("pgd", "gauss-newton", "weighted", "each-step", "classical-dvc", "spam")
 """Our own methods, in the order in which they are shown; others come after them."""
 
 EXTRA = ("spam",)
@@ -126,34 +126,34 @@ _DIRECT = MeasureOptions(rigid=(_direct("coarse"), _direct(2)), deformation=_SEC
 
 
 def pgd(experiment: Experiment) -> Measurement:
-    """Assume that the motion is a sum of few space-time modes of rigid sections and the paper's seven time functions.
+    """Assume that few space-time modes hold the motion, of rigid sections and of the paper's seven time functions:
+    eight of the sample as a whole, then four of its sections, each from one linearisation. All pixels count alike.
 
-    Greedy modes from one linearisation each, all pixels weighted alike, as in the paper: `pdvc.options.paper_options`.
+    The paper's protocol: `pdvc.options.paper_options`.
     """
     return measure(experiment, paper_options())
 
 
 def gauss_newton(experiment: Experiment) -> Measurement:
-    """Assume sections that move rigidly or contract, and nine time functions; every pixel counts alike.
-
-    All unknowns are solved for at once, from coarse to fine.
+    """Assume sections that move rigidly or contract, and nine time functions; solve for all unknowns at once, from
+    coarse to fine. All pixels count alike, and a prior of 30 voxels holds what the radiographs do not determine.
     """
     return measure(experiment, _DIRECT)
 
 
 def weighted(experiment: Experiment) -> Measurement:
-    """Assume what `gauss-newton` does, and besides that the noise of every pixel is known, by which it is weighted.
-
-    With its Gaussian prior this is the efficient estimator, as far as motion and volume are what the model says.
+    """Assume what gauss-newton does, and besides that the noise of each pixel is known, by which it is weighted.
+    With the prior this is the efficient estimator, as far as motion, volume and noise are what the model says.
     """
     return measure(experiment, _DIRECT.model_copy(update={"weighting": "noise"}))
 
 
 def each_step(experiment: Experiment) -> Measurement:
-    """Assume sections that move rigidly or contract, and nothing about time: each radiograph is measured by itself.
+    """Assume sections that move rigidly or contract, and nothing about time: each radiograph is measured by itself,
+    so that what it hardly shows, motion along its beam above all, is left to noise and to the prior of 30 voxels.
 
-    The prior allows each motion 30 voxels at each step. With no other step to lean on, a rigid motion of many pixels
-    has to be found from one radiograph: the rigid stage begins at a coarser scale than that of the other methods.
+    The prior is meant at each step. With no other step to lean on, a motion of many pixels has to be found from one
+    radiograph: the rigid stage begins at a coarser scale than that of the other methods.
     """
     coarsest = max(scale for scale in (2, 4, 8, 16) if scale == 2 or experiment.geometry.rows >= 25 * scale)
     scales = [scale for scale in (16, 8, 4, 2) if scale <= coarsest]
@@ -169,8 +169,10 @@ def each_step(experiment: Experiment) -> Measurement:
 
 @looks_at_volumes
 def classical_dvc(experiment: Experiment) -> Measurement:
-    """Assume sections that move rigidly or contract, and a test held at some steps for as long as a full scan takes.
+    """Assume sections that move rigidly or contract, and a sample that stands still at some steps for as long as a
+    full scan takes, without creep. Each scan is compared with the reference voxel by voxel; between scans nothing is
+    known.
 
-    Classical digital volume correlation of the interrupted scans: `pdvc.volume_correlation`.
+    Classical digital volume correlation: `pdvc.volume_correlation`.
     """
     return correlate(experiment, _DIRECT)
