@@ -17,7 +17,7 @@ from tests.test_job import TINY
 from tests.test_methods import install
 from validation.compare import Comparison, with_scans
 from validation.compare_figures import Point, cost_figure, draw_cost, draw_steps, steps_figure, style_of
-from validation.compare_tables import TextTable, number, with_interval
+from validation.compare_tables import TextTable, number, with_bounds, with_interval
 from validation.figures import new_figure
 from validation.intervals import Estimate
 from validation.methods import Method, looks_at_volumes
@@ -128,6 +128,19 @@ def test_numbers_have_three_digits(value, text):
 )
 def test_intervals_are_half_widths_with_two_digits(value, half, scale, text):
     assert with_interval(Estimate(value=value, low=value - half, high=value + half), scale) == text
+
+
+@pytest.mark.parametrize(
+    ("low", "value", "high", "text"),
+    [
+        (0.0101, 0.0123, 0.0161, "0.0123 [0.0101, 0.0161]*"),
+        (-0.2, -0.15, -0.1, "-0.150 [-0.200, -0.100]*"),
+        (-0.1, 0.05, 0.15, "0.05 [-0.10, 0.15]"),
+        (np.nan, 0.05, np.nan, "0.0500"),
+    ],
+)
+def test_differences_have_the_bounds_of_their_interval_and_a_star_without_zero(low, value, high, text):
+    assert with_bounds(Estimate(value=value, low=low, high=high)) == text
 
 
 def test_a_table_as_markdown_and_latex():
@@ -307,6 +320,8 @@ def test_the_page_tells_what_was_added_what_failed_and_what_is_assumed(done):
     assert "This is not told" not in page
     assert "Fewer than 3" in page
     assert "Two orders of magnitude in acquisition time" in page
+    # both made the same estimate, so that scans are no more exact
+    assert "times across 1.00, vertical 1.00, along 1.00, strain 1.00." in page
     figures = sorted(path.name for path in (out / "figures").iterdir())
     assert figures == ["tiny_computing_time.png", "tiny_machine_time.png", "tiny_steps.png"]
     assert page.count("data:image/png;base64,") == 3

@@ -37,6 +37,7 @@ from validation.methods import LooksAt, Method, find_method
 from validation.paired import errors_of, summarised
 from validation.runs import Part, Result, Scalar, collected, run_trials
 from validation.scores import score
+from validation.study_report import machine
 from validation.trial import clean_parts, flattened, score_columns, simulated
 
 SCANS = 6
@@ -225,5 +226,10 @@ def compare(
     run_trials(runs, folder, scheduler=scheduler, workers=workers, progress=progress)
     rows: Sequence[Mapping[str, Scalar]] = collected(runs, folder).to_pylist()
     return write_comparison(
-        folder, comparison.scenarios, comparison.methods, summarised(rows, folder), comparison.notes()
+        folder,
+        comparison.scenarios,
+        comparison.methods,
+        summarised(rows, folder),
+        comparison.notes(),
+        machine(scheduler, workers),
     )

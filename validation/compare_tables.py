@@ -128,11 +128,17 @@ def own_table(scores: Sequence[MethodScores]) -> TextTable:
 
 
 def difference_table(differences: Sequence[Difference]) -> TextTable:
-    """Return the paired differences of rms errors; a star where the interval leaves out zero."""
+    """Return the paired differences of rms errors with the bounds of their intervals."""
     return TextTable(
         caption=f"{differences[0].scenario}: mean difference of rms errors, same data, same steps",
         head=("first method less second", *_error_head()),
-        rows=tuple((f"{each.method} − {each.other}", *_error_cells(each.error, starred=True)) for each in differences),
+        rows=tuple(
+            (
+                f"{each.method} − {each.other}",
+                *(with_bounds(each.error[name], _SCALE.get(name, 1.0)) for name in QUANTITIES),
+            )
+            for each in differences
+        ),
     )
 
 
@@ -156,18 +162,22 @@ def gain_table(found: Sequence[Gain], projections: str, volumes: str) -> TextTab
     )
 
 
+def ratio_text(projections: Sequence[MethodScores], volumes: Sequence[MethodScores]) -> str:
+    """Say how many times the errors by full scans those by radiographs are, each by the method that errs least."""
+    parts = []
+    for name in QUANTITIES:
+        by_radiographs = min(each.error[name].value for each in projections)
+        by_scans = min(each.error[name].value for each in volumes)
+        parts.append(f"{_NAMES[name]} {number(by_radiographs / by_scans) if by_scans > 0 else _UNKNOWN}")
+    return ", ".join(parts)
+
+
 def _error_head() -> tuple[str, ...]:
     return tuple(f"{_NAMES[name]}, {_UNITS[name]}" for name in QUANTITIES)
 
 
-def _error_cells(error: Mapping[str, Estimate], *, starred: bool = False) -> tuple[str, ...]:
-    cells = []
-    for name in QUANTITIES:
-        scale = _SCALE.get(name, 1.0)
-        estimate = error[name]
-        star = "*" if starred and (estimate.low > 0 or estimate.high < 0) else ""
-        cells.append(with_interval(estimate, scale) + star)
-    return tuple(cells)
+def _error_cells(error: Mapping[str, Estimate]) -> tuple[str, ...]:
+    return tuple(with_interval(error[name], _SCALE.get(name, 1.0)) for name in QUANTITIES)
 
 
 def with_interval(estimate: Estimate, scale: float = 1.0) -> str:
@@ -175,11 +185,25 @@ def with_interval(estimate: Estimate, scale: float = 1.0) -> str:
     value, half = estimate.value * scale, estimate.half_width * scale
     if not math.isfinite(half) or half <= 0:
         return number(value)
-    digits = 1 - math.floor(math.log10(half))
-    # no more than five digits of the value, however narrow its interval
-    most = 4 - math.floor(math.log10(max(abs(value), half)))
-    digits = max(min(digits, most), 0)
+    digits = _digits(value, half)
     return f"{value:.{digits}f} ± {half:.{digits}f}"
+
+
+def with_bounds(estimate: Estimate, scale: float = 1.0) -> str:
+    """Return a value and the bounds of its interval in brackets, with a star where zero lies outside."""
+    value, half = estimate.value * scale, estimate.half_width * scale
+    if not math.isfinite(half) or half <= 0:
+        return number(value)
+    digits = _digits(value, half)
+    low, high = (f"{bound * scale:.{digits}f}" for bound in (estimate.low, estimate.high))
+    star = "*" if estimate.low > 0 or estimate.high < 0 else ""
+    return f"{value:.{digits}f} [{low}, {high}]{star}"
+
+
+def _digits(value: float, half: float) -> int:
+    """Return the decimals that give two digits of half an interval, but no more than five of the value."""
+    most = 4 - math.floor(math.log10(max(abs(value), half)))
+    return max(min(1 - math.floor(math.log10(half)), most), 0)
 
 
 def number(value: float) -> str:
