@@ -248,7 +248,8 @@ class TestAWholeStudy:
         assert set(table["status"]) == {"done"}
         assert table["seconds"].min() > 0
         assert {path.name for path in out.iterdir()} == {
-            *("runs", "errors", "failed", "figures", "table.parquet", "summary.csv", "scores.csv", "study.html"),
+            *("runs", "errors", "failed", "figures", "table.parquet"),
+            *("summary.csv", "scores.csv", "coverage.csv", "study.html"),
         }
         assert len(list((out / "figures").iterdir())) == 2
         assert str(FACTORS.splitlines()[2]) in (out / "study.html").read_text().replace("&#34;", '"')

@@ -1,4 +1,4 @@
-"""What a study leaves for a reader: summary.csv, scores.csv, figures, and one self-contained page, study.html."""
+"""What a study leaves for a reader: summary, scores and coverage as CSV, figures, and one page, study.html."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import jinja2
 import numpy as np
 import pandas as pd
 
+from validation.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
 from validation.runs import FAILED
 from validation.study import Study
 from validation.study_figures import study_pictures
@@ -34,7 +35,8 @@ def write_study_report(
     """
     summary = summarise(study, table, folder)
     scores = mean_scores(study, table)
-    for name, frame in (("summary", summary), ("scores", scores)):
+    shown = honesty(study, table)
+    for name, frame in (("summary", summary), ("scores", scores), ("coverage", coverage_table(shown))):
         partial = folder / f"{name}.csv.partial"
         frame.to_csv(partial, index=False)
         partial.replace(folder / f"{name}.csv")
@@ -47,7 +49,7 @@ def write_study_report(
         pictures.append({"name": picture.name, "caption": picture.caption, "data": data})
     page = folder / "study.html"
     partial = page.with_name("study.html.partial")
-    partial.write_text(_page(study, text, table, summary, scores, pictures, where), encoding="utf-8")
+    partial.write_text(_page(study, text, table, summary, scores, shown, pictures, where), encoding="utf-8")
     partial.replace(page)
     return page, summary
 
@@ -68,6 +70,7 @@ def _page(
     table: pd.DataFrame,
     summary: pd.DataFrame,
     scores: pd.DataFrame,
+    shown: list[Honesty],
     pictures: list[dict[str, str]],
     where: str,
 ) -> str:
@@ -93,6 +96,14 @@ def _page(
         quantities=[HEADINGS[quantity] for quantity in QUANTITIES],
         bounded=any(f"bound_{quantity}" in summary for quantity in QUANTITIES),
         rows=[_summary_row(row, factors) for _, row in summary.iterrows()],
+        coverage=[
+            {
+                "which": [_cell(value) for value in each.combination.values()],
+                "verdict": verdict(each),
+                "rows": _covered(each),
+            }
+            for each in shown
+        ],
         scores_columns=list(scores.columns),
         scores=[[_cell(value) for value in row] for row in scores.itertuples(index=False)],
         pictures=pictures,
@@ -100,6 +111,20 @@ def _page(
         hours=table["seconds"].sum() / 3600,
         version=version("pdvc-bench"),
     )
+
+
+def _covered(found: Honesty) -> list[list[str]]:
+    """Return a line for each direction: stated deviation, z, and the coverages with their binomial intervals."""
+    lines = []
+    for direction in DIRECTIONS:
+        shares = [
+            f"{100 * one.found.value:.1f} ({100 * one.binomial[0]:.0f} to {100 * one.binomial[1]:.0f})"
+            for one in found.covered
+            if one.direction == direction
+        ]
+        name = HEADINGS["strain" if direction == "strain" else f"voxel_{direction}"]
+        lines.append([name, _cell(found.predicted[direction]), _cell(found.z_rms[direction]), *shares])
+    return lines
 
 
 def _summary_row(row: pd.Series, factors: list[str]) -> dict[str, list[str]]:
