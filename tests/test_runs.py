@@ -111,6 +111,16 @@ class TestAnEventfulJob:
             pd.testing.assert_frame_equal(run_trials(mended, folder / "out"), again)
 
 
+def test_runs_that_share_a_part_follow_each_other(tmp_path, address):
+    trials = [Sum(group, n, tmp_path) for n in range(3) for group in "fgh"]
+    table = run_trials(trials, tmp_path / "out", scheduler=address)
+    began = [
+        line.removeprefix("began ")[0] for line in (tmp_path / "diary").read_text().splitlines() if "began" in line
+    ]
+    assert "".join(began) == "fffggghhh"
+    assert list(table["group"]) == list("fgh" * 3)
+
+
 def test_an_interrupted_job_goes_on_and_repeats_nothing(tmp_path, address):
     trials = [Sum("c", n, tmp_path) for n in range(30)]
 

@@ -199,6 +199,16 @@ def test_a_mistake_is_answered_in_one_line_before_anything_is_done(tmp_path, tex
     assert not (tmp_path / "out").exists()
 
 
+def test_the_studies_of_the_documentation_are_valid(tmp_path):
+    text = (Path(__file__).parent.parent / "docs" / "studies.md").read_text()
+    first, second = (block.partition("```")[0] for block in text.split("```toml")[1:])
+    found = trials(tmp_path, first)
+    assert len(found) == 3 * 2 * 10
+    assert found[-1].factors == {"photons_per_pixel": 8000.0, "nodules": "coarse"}
+    assert found[-1].scenario.graphite.mean_diameter_mm == 0.4
+    assert len(trials(tmp_path, 'name = "spread"\nrepetitions = 1\n' + second)) == 40
+
+
 def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
     result = pdvc_bench("study", "nois", "-o", tmp_path / "out")
     assert result.exit_code == 2

@@ -22,6 +22,7 @@ import logging
 import math
 import os
 import shutil
+import threading
 import time
 import traceback
 import uuid
@@ -52,6 +53,9 @@ ANSWER_S = 10.0
 """How long to wait for a scheduler to answer, s."""
 DEATHS_ALLOWED = 2
 """Workers that a run may lose before it is set aside."""
+_ONE_AT_A_TIME = threading.Lock()
+"""Numba's own threads end a process in which two parallel kernels run at once: a worker of a cluster that was given
+several threads does one thing after the other."""
 _TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 
 
@@ -198,6 +202,7 @@ class _Session:
 
         for run in runs:
             self._uses.update(part.name for part in _all_parts(run.parts()))
+        runs = self._together(runs)
         self._left = len(runs)
         self._tell()
         aside: list[Run] = []
@@ -208,6 +213,19 @@ class _Session:
                 self._take(run, future)
         for run, future in self._finished(aside, lambda: 1):
             self._take(run, future)
+
+    def _together(self, runs: list[Run]) -> list[Run]:
+        """Return the runs in an order in which those that share a part follow each other: it is kept shortly.
+
+        Of several parts the one that the fewest share counts; else the order stays.
+        """
+        first: dict[str, int] = {}
+        places = []
+        for place, run in enumerate(runs):
+            shared = [part.name for part in run.parts() if self._uses[part.name] > 1]
+            rarest = min(shared, key=lambda name: self._uses[name], default=run.key)
+            places.append(first.setdefault(rarest, place))
+        return [runs[place] for place in sorted(range(len(runs)), key=lambda place: places[place])]
 
     def _finished(self, runs: list[Run], window: Any) -> Iterator[tuple[Run, Future]]:
         """Submit runs, as many at a time as the window allows, and yield each when it is finished."""
@@ -287,7 +305,7 @@ def _all_parts(parts: tuple[Part, ...]) -> tuple[Part, ...]:
 
 def _make(part: Part, shared: Path, needed: list[None]) -> None:
     """Make a part on a worker; where that fails, the runs that need it try by themselves and have a row to say so."""
-    with suppress(Exception):
+    with _ONE_AT_A_TIME, suppress(Exception):
         part.make(shared)
 
 
@@ -300,7 +318,8 @@ def _carry_out(run: Run, folder: Path, shared: Path, parts: list[None]) -> bool:
     numba.set_num_threads(1)
     started = time.perf_counter()
     try:
-        result = run.carry_out(shared)
+        with _ONE_AT_A_TIME:
+            result = run.carry_out(shared)
     except Exception as error:  # whatever it is, it is this row's reason
         _write_failure(run, folder, error, traceback.format_exc(), time.perf_counter() - started)
         return False

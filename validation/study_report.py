@@ -134,7 +134,8 @@ def _summary_row(row: pd.Series, factors: list[str]) -> dict[str, list[str]]:
         cells += [_with_interval(row, f"{part}_{quantity}") for part in PARTS]
         if f"bound_{quantity}" in row:
             cells.append(_cell(row[f"bound_{quantity}"]))
-    return {"which": [_cell(row[name]) for name in [*factors, "runs", "failed"]], "cells": cells}
+    which = [row[name] for name in (*factors, "runs", "failed")]
+    return {"which": [f"{each:g}" if isinstance(each, float) else str(each) for each in which], "cells": cells}
 
 
 def _with_interval(row: pd.Series, name: str) -> str:
