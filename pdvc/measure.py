@@ -22,7 +22,7 @@ from pdvc.compilation import compile_kernels
 from pdvc.equations import Equations, linearise, residuals
 from pdvc.experiment import Experiment
 from pdvc.history import time_basis
-from pdvc.measurement import Measurement, Stage
+from pdvc.measurement import Measurement, Stage, step_covariance, turned_std
 from pdvc.noise import known_from_residual, propagate
 from pdvc.options import MeasureOptions, StageOptions, resolved
 from pdvc.preparation import Prepared, bases, calibrated, noise_of, prepare, snr_of, used_window
@@ -31,7 +31,7 @@ from pdvc.progress import Progress, silent
 from pdvc.sections import SectionBasis
 from pdvc.solution import Solution
 from pdvc.store import Store
-from pdvc.uncertainty import posterior
+from pdvc.uncertainty import by_source, posterior
 
 __all__ = ["MeasureOptions", "StageOptions", "measure"]
 
@@ -88,6 +88,7 @@ def measure(
     )
     known = posterior(equations, time_functions, _prior(sections, options), propagated.covariance)
     amplitude[:, ~known.observed] = np.nan
+    sources = by_source(equations, time_functions, _prior(sections, options), propagated.parts)
     snr = snr_of(fine.images)
     ended = time.perf_counter()
     return Measurement(
@@ -115,6 +116,10 @@ def measure(
         residual_rigid=after_rigid,
         residual_final=equations.residual,
         residual_tests=propagated.tests,
+        std_by_source={
+            name: _on_the_axis(part, sections, known.observed, time_functions, experiment.test.angle_rad)
+            for name, part in sources.items()
+        },
         seconds={
             "compile": started - compiling,
             "reconstruct": solving - started,
@@ -124,6 +129,20 @@ def measure(
         options=options.template(),
         versions=versions(),
     )
+
+
+def _on_the_axis(
+    covariance: Floats, basis: SectionBasis, observed: NDArray[np.bool_], time_functions: Floats, angle_rad: Floats
+) -> tuple[float, float, float]:
+    """Return the rms standard deviations of u on the axis, over steps and observed sections, in three directions."""
+    points = np.zeros((int(observed.sum()), 3))
+    points[:, 2] = basis.height_mm[observed]
+    found = [
+        turned_std(basis, step_covariance(covariance, time_functions, t), float(angle), points)
+        for t, angle in enumerate(angle_rad)
+    ]
+    across, vertical, along = np.sqrt((np.concatenate(found) ** 2).mean(axis=0)).tolist()
+    return across, vertical, along
 
 
 def _prior(basis: SectionBasis, options: MeasureOptions) -> Prior:

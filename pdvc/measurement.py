@@ -110,6 +110,9 @@ class Measurement:
     residual_final: NDArray[np.float32]
     residual_tests: ResidualTests | None = None
     """Whether the final residual is the noise that was expected; None: not asked."""
+    std_by_source: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """What noise of radiographs, views and flats, and the prior, each make of the standard deviation of u on the axis:
+    rms over steps and observed sections, voxels, across the beam, vertical, along the beam. Squares add up."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent, by part: at least ``reconstruct`` and ``measure``."""
     options: str = ""
@@ -245,6 +248,9 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
             data.attrs[f"{name}_{key}"] = getattr(stage, key)
     data.attrs["stages"] = len(m.stages)
     packed = {name: _packing(data[name].values) for name in data if str(name).startswith("residual_")}
+    if m.std_by_source:
+        data = data.assign_coords(source=list(m.std_by_source))
+        data["std_by_source"] = (("source", "direction"), np.array(list(m.std_by_source.values())), {"units": "voxel"})
     partial = path.with_name(path.name + ".partial")
     path.parent.mkdir(parents=True, exist_ok=True)
     data.to_netcdf(partial, engine="h5netcdf", encoding=packed)
@@ -337,6 +343,12 @@ def _unpack(data: xr.Dataset) -> Measurement:
         )
         if "residual_chi2_reduced" in attrs
         else None,
+        std_by_source={
+            str(name): (float(values[0]), float(values[1]), float(values[2]))
+            for name, values in zip(data["source"].values, get("std_by_source"), strict=True)
+        }
+        if "source" in data
+        else {},
         seconds={
             name.removeprefix("seconds_"): float(value)
             for name, value in attrs.items()

@@ -23,7 +23,7 @@ re-projected volume holds at most the same noise, so that V is then an upper bou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,10 +90,16 @@ def known_from_residual(rms: float, window: tuple[int, int], detector: tuple[int
 class Propagated:
     """Hold the covariance V of h."""
 
-    covariance: Floats
-    """(function * unknown, function * unknown), or (function, unknown, unknown) where functions share no step."""
+    parts: Mapping[str, Floats]
+    """By source, ``radiographs``, ``views`` and ``flats``: (function * unknown, function * unknown), or (function,
+    unknown, unknown) where functions share no step."""
     tests: ResidualTests
     """Whether the residual is that noise."""
+
+    @property
+    def covariance(self) -> Floats:
+        """Return V, of all sources together."""
+        return np.asarray(sum(self.parts.values()))
 
 
 def propagate(
@@ -116,6 +122,7 @@ def propagate(
     images = replace(images, volume=volume)
     apart = separate(time_functions)
     unknowns = basis.shape[0] * basis.shape[1]
+    own: dict[tuple[int, int], Floats] = {}
     pairs: dict[tuple[int, int], Floats] = {}
     static = np.zeros((len(time_functions), unknowns, unknowns)) if apart else None
     pile = Pile(noise.flat.shape, time_functions, basis.shape[1])
@@ -127,14 +134,14 @@ def propagate(
     def add_step(t: int, field: Sensitivities) -> Sensitivities:
         """Add what the step's own noise and the flats' do; return Y, which its views' noise needs."""
         weight, image = images.weight[t % len(images.weight)], noise.step(t)
-        own = replace(field, values=field.values * weight[..., None])
-        _add(pairs, (t, t), product(own, own, image.variance, unknowns))
+        weighted = replace(field, values=field.values * weight[..., None])
+        own[t, t] = product(weighted, weighted, image.variance, unknowns)
         places = systematic.places(images.rays[t], basis, amplitude[t], images.voxel_mm)
-        moved = _spread(own, places, noise.flat.shape)
+        moved = _spread(weighted, places, noise.flat.shape)
         view = _between(noise, systematic, t)
         here = pile if static is None else Pile(noise.flat.shape, np.ones((1, len(amplitude))), basis.shape[1])
         here.add(t, moved, view.slope, (0, 0))
-        here.add(t, own, -image.slope, systematic.corner)
+        here.add(t, weighted, -image.slope, systematic.corner)
         if static is not None:
             static[time_functions[:, t] != 0] += here.covariance(noise.flat, unknowns)
         tests.add(residual[t], weight > 0, image, view, noise.flat, places, systematic.corner)
@@ -155,9 +162,15 @@ def propagate(
         for t in users[view]:
             if last_use[t] == view:
                 del held[t]
-    covariance = _joined(pairs, time_functions, apart)
-    covariance += pile.covariance(noise.flat, unknowns) if static is None else _scaled(static, time_functions)
-    return Propagated(covariance=covariance, tests=tests.result(time_functions.shape[0] * unknowns))
+    flats = pile.covariance(noise.flat, unknowns) if static is None else _scaled(static, time_functions)
+    return Propagated(
+        parts={
+            "radiographs": _joined(own, time_functions, apart),
+            "views": _joined(pairs, time_functions, apart),
+            "flats": flats,
+        },
+        tests=tests.result(time_functions.shape[0] * unknowns),
+    )
 
 
 def separate(time_functions: Floats) -> bool:

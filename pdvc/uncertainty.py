@@ -13,6 +13,7 @@ it, near 0 where the value rests on the prior. A section that no used pixel sees
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,6 +74,22 @@ def posterior(equations: Equations, time_functions: Floats, prior: Prior, noise:
         data_share=np.clip(1 - variance / before, 0, 1).reshape(steps, *shape),
         observed=information > UNSEEN * np.median(information),
     )
+
+
+def by_source(
+    equations: Equations, time_functions: Floats, prior: Prior, parts: Mapping[str, Floats]
+) -> dict[str, Floats]:
+    """Return what each source of noise (noise.Propagated.parts), and the prior, add to the covariance C.
+
+    Empty where each step has a function of its own.
+    """
+    if separate(time_functions):
+        return {}
+    matrix = hessian(equations.matrix, time_functions)
+    ridge = np.tile(prior.ridge(equations.rms), len(time_functions))
+    found = {name: sandwich(matrix, part, ridge, 0.0) for name, part in parts.items()}
+    gamma2 = max(equations.rms, LEAST_RMS) ** 2
+    return {**found, "prior": sandwich(matrix, np.zeros_like(matrix), ridge, gamma2)}
 
 
 def sandwich(matrix: Floats, noise: Floats, ridge: Floats, gamma2: float) -> Floats:
