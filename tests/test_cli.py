@@ -100,7 +100,7 @@ def test_report_without_truth(tmp_path, motion):
     assert result.exit_code == 0, result.stderr
     page = (tmp_path / "out" / "report.html").read_text()
     assert "No truth was given" in page
-    assert page.count("data:image/png;base64,") == len(list((tmp_path / "out" / "figures").iterdir())) == 9
+    assert page.count("data:image/png;base64,") == len(list((tmp_path / "out" / "figures").iterdir())) == 11
     assert "http" not in page.replace("http-equiv", "")  # nothing is fetched
 
 

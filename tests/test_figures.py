@@ -8,6 +8,7 @@ import pytest
 from tests import synthetic_records as records
 from validation import figures
 from validation.axis import axis_history
+from validation.axis_deviation import axis_deviation
 from validation.scores import point_errors
 
 
@@ -121,3 +122,64 @@ def test_the_noise_floor_is_drawn_beside_the_true_scatter_where_there_is_one():
     _, (ax,) = figures.new_figure(7, 3)
     figures.draw_noise_floor(levels, scatter, None, None, ax)
     assert len(ax.lines) == 3
+
+
+def test_a_band_is_two_standard_deviations_around_the_error(case):
+    measurement, truth = case
+    axis = axis_deviation(measurement, truth)
+    figure = figures.error_bands(axis)
+    assert len(figure.axes) == 12  # three heights, three directions and the strain
+    levels = [
+        np.flatnonzero(np.isclose(axis.level_mm, float(ax.get_ylabel()[4:-3]), atol=0.006)) for ax in figure.axes[::4]
+    ]
+    for row, (level,) in enumerate(levels):
+        histories = [*zip(axis.error[:, level].T, axis.std[:, level].T, strict=True)]
+        histories.append((100 * axis.strain_error[:, level], 100 * axis.strain_std[:, level]))
+        for ax, (error, std) in zip(figure.axes[4 * row : 4 * row + 4], histories, strict=True):
+            np.testing.assert_array_equal(ax.lines[1].get_ydata(), error)
+            (band,) = ax.collections
+            corners = band.get_paths()[0].vertices
+            for step in (3, 17):
+                at = np.unique(corners[corners[:, 0] == step, 1])
+                np.testing.assert_allclose(at[[0, -1]], [error[step] - 2 * std[step], error[step] + 2 * std[step]])
+    assert axis.level_mm[levels[0][0]] > axis.level_mm[levels[2][0]]
+
+
+def test_bands_of_steps_measured_alone_are_bars():
+    _, (ax,) = figures.new_figure(7, 3)
+    values = np.array([np.nan, 1.0, np.nan, 3.0])
+    figures.draw_band(values, np.full(4, 0.5), ax)
+    (bars,) = ax.collections
+    ends = np.array([segment[:, 1] for segment in bars.get_segments() if len(segment)])
+    np.testing.assert_allclose(ends[np.isfinite(ends).all(axis=1)], [[0, 2], [2, 4]])
+
+
+def test_maps_of_standard_deviations_hide_the_unobserved(case):
+    measurement, _ = case
+    axis = axis_deviation(measurement)
+    figure = figures.std_maps(axis)
+    maps = [np.ma.filled(ax.collections[0].get_array(), np.nan) for ax in figure.axes[:4]]
+    for k in range(3):
+        np.testing.assert_array_equal(maps[k], axis.std[..., k].T)
+    np.testing.assert_array_equal(maps[3], 100 * axis.strain_std.T)
+    assert np.isnan(maps[0][8]).all()
+    assert np.isfinite(maps[0][:8]).all()
+    figure.draw_without_rendering()
+
+
+def test_without_truth_standard_deviations_are_drawn_against_the_step(case):
+    measurement, _ = case
+    axis = axis_deviation(measurement)
+    figure = figures.std_histories(axis)
+    assert [len(ax.lines) for ax in figure.axes] == [3, 3, 3, 3]
+    drawn = {line.get_label(): line.get_ydata() for line in figure.axes[1].lines}
+    for level in (1, 3, 5):
+        np.testing.assert_array_equal(drawn[f"z = {axis.level_mm[level]:.2f} mm"], axis.std[:, level, 1])
+
+
+def test_uncertainties_of_a_motion_that_nobody_saw_can_be_drawn():
+    measurement = records.measurement(np.full((records.STEPS, 9, 6), np.nan))
+    axis = axis_deviation(measurement)
+    assert np.isnan(axis.std).all()
+    for figure in (figures.std_maps(axis), figures.std_histories(axis)):
+        figure.draw_without_rendering()

@@ -57,7 +57,7 @@ def test_the_job_writes_all_it_promises(job):
     assert "error across beam" in result.stdout
     for name in ("experiment/experiment.toml", "measurement.nc", "scores.json", "report.html"):
         assert (out / name).is_file()
-    assert len(list((out / "figures").glob("*.png"))) == 11
+    assert len(list((out / "figures").glob("*.png"))) == 13
     assert not list(out.rglob("*.partial"))
 
 
@@ -73,6 +73,20 @@ def test_the_report_tells_the_noise_floor_beside_the_true_error(job):
     scores = json.loads((folder / "out" / "scores.json").read_text())["error_voxel"]
     assert values[4] == pytest.approx([scores[k] for k in ("across_beam", "vertical", "along_beam")], abs=1e-4)
     assert "over the first 11 steps" in page
+
+
+def test_the_report_tells_whether_the_standard_deviations_are_right(job):
+    folder, _ = job
+    page = (folder / "out" / "report.html").read_text()
+    table = page.partition('<table id="trust">')[2].partition("</table>")[0]
+    rows = [re.findall(r"<td>([^<]*)</td>", line) for line in table.splitlines() if "<td>" in line]
+    scores = json.loads((folder / "out" / "scores.json").read_text())
+    found = scores["calibration"]
+    for row, key in zip(rows, ("across_beam", "vertical", "along_beam", "strain"), strict=True):
+        assert float(row[3]) == pytest.approx(found["z_rms"][key], abs=0.006)
+        assert float(row[6]) == pytest.approx(100 * found["coverage_95"][key], abs=0.6)
+    assert f"NEES = {found['nees']:.0f}" in page
+    assert f"(N - p) = {scores['chi2_reduced']:.2f}" in page
 
 
 def test_scores_are_complete_and_plausible(job):
@@ -121,7 +135,7 @@ def test_score_and_report_alone_agree_with_the_run(job):
         assert alone[key] == together[key]
     result = pdvc_bench("report", *arguments, "-o", folder / "page")
     assert result.exit_code == 0, result.stderr
-    assert len(list((folder / "page" / "figures").glob("*.png"))) == 11
+    assert len(list((folder / "page" / "figures").glob("*.png"))) == 13
 
 
 def test_a_truncated_stack_is_named(job):

@@ -122,6 +122,9 @@ def test_a_measurement_with_unscanned_steps_is_written_read_scored_and_reported(
     assert "nan" not in text.split("<h2>Figures</h2>")[0].lower()
     names = {path.name for path in (tmp_path / "figures").glob("*.png")}
     assert {"errors.png", "fig07_translations.png", "fig10b_strain.png"} < names
+    assert {"uncertainty_bands.png", "uncertainty_maps.png"} < names
+    assert "The residual was not tested against noise." in text
+    assert "NEES" not in text
     assert not any("residual" in name for name in names)
     write_report(tmp_path / "without", again)
 

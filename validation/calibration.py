@@ -25,7 +25,8 @@ from scipy import linalg, stats
 
 from pdvc.measurement import Measurement
 from pdvc.sections import SectionBasis
-from validation.axis import TruePoints, axis_history, current_positions
+from validation.axis import TruePoints, current_positions
+from validation.axis_deviation import axis_deviation
 
 Floats = NDArray[np.float64]
 
@@ -63,8 +64,9 @@ def calibration(measurement: Measurement, truth: TruePoints, errors: Floats) -> 
     positions = current_positions(truth)
     deviations = np.stack([measurement.turned_std(step, x) for step, x in enumerate(positions)])
     deviations[np.isnan(errors)] = np.nan
-    strain, strain_std = _strains(measurement, truth)
-    groups = [(errors[..., k], deviations[..., k]) for k in range(3)] + [(strain, strain_std)]
+    axis = axis_deviation(measurement, truth)
+    assert axis.strain_error is not None
+    groups = [(errors[..., k], deviations[..., k]) for k in range(3)] + [(axis.strain_error, axis.strain_std)]
     scores = [_z(error, deviation) for error, deviation in groups]
     nees, unknowns = _nees(measurement, truth)
 
@@ -123,23 +125,6 @@ def _nees(measurement: Measurement, truth: TruePoints) -> tuple[float, int]:
     scale = 1 / np.sqrt(np.diag(c))
     factor = linalg.cho_factor(c * scale[:, None] * scale)
     return float((d * scale) @ linalg.cho_solve(factor, d * scale)), int(kept.sum())
-
-
-def _strains(measurement: Measurement, truth: TruePoints) -> tuple[Floats, Floats]:
-    """Return errors and standard deviations of the strain on the axis (step, interval)."""
-    axis = axis_history(measurement, truth)
-    assert axis.true is not None
-    error = axis.strain(axis.measured) - axis.strain(axis.true)
-    heights = axis.level_mm + axis.true[..., 2] * measurement.voxel_mm
-    deviation = np.full(error.shape, np.nan)
-    for step, z in enumerate(heights):
-        known = np.isfinite(error[step])
-        if known.any():
-            # between current heights; strain refers to the distance at rest
-            stretched = np.diff(z) / np.diff(axis.level_mm)
-            filled = np.where(np.isfinite(z), z, axis.level_mm)
-            deviation[step, known] = (measurement.strain_std(step, filled) * stretched)[known]
-    return error, deviation
 
 
 def _z(error: Floats, deviation: Floats) -> Floats:

@@ -18,12 +18,21 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from validation.axis import AxisHistory
+from validation.axis_deviation import AxisDeviation
 
 Floats = NDArray[np.float64]
 
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#777777"
 TRUTH = {"color": "black", "linewidth": 1.0, "linestyle": (0, (4, 2))}
 UNOBSERVED = "#d9d9d9"
+
+
+QUANTITIES = (
+    "across the beam (voxel)",
+    "vertical (voxel)",
+    "along the beam (voxel)",
+    r"strain $\varepsilon_{zz}$ (%)",
+)
 
 
 def new_figure(width_in: float, height_in: float, columns: int = 1) -> tuple[Figure, list[Axes]]:
@@ -223,6 +232,87 @@ def stretch_maps(axis: AxisHistory) -> tuple[Figure, Figure]:
         cmap="inferno",
     )
     return first, second
+
+
+def draw_band(values: Floats, std: Floats, ax: Axes) -> Axes:
+    """Draw a history (step,) with a band of 2 standard deviations (step,) on either side, in the values' unit."""
+    steps = np.arange(len(values))
+    if _marker(values) == "none":
+        ax.fill_between(steps, values - 2 * std, values + 2 * std, color=BLUE, alpha=0.3, linewidth=0)
+        ax.plot(steps, values, color=BLUE, linewidth=1.2)
+    else:
+        ax.errorbar(steps, values, 2 * std, color=BLUE, linewidth=1.2, marker=".", capsize=2)
+    return _tidy(ax)
+
+
+def error_bands(axis: AxisDeviation) -> Figure:
+    """Draw the error at three heights (rows) of u in three directions and of the strain (columns), with its band."""
+    assert axis.error is not None
+    assert axis.strain_error is not None
+    rows = _three_levels(axis)
+    figure = Figure(figsize=(11.5, 1.7 * len(rows) + 0.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(rows), 4, squeeze=False, sharex=True, sharey="col")
+    for row, level in zip(grid, rows, strict=True):
+        for column, (error, std) in enumerate(zip(_at(axis.error, axis.strain_error, level),
+                                                  _at(axis.std, axis.strain_std, level), strict=True)):  # fmt: skip
+            row[column].axhline(0, color="black", linewidth=0.8)
+            draw_band(error, std, row[column])
+        row[0].set_ylabel(f"z = {axis.level_mm[level]:.2f} mm")
+    for ax, title in zip(grid[0], QUANTITIES, strict=True):
+        ax.set_title(title, fontsize=10)
+    for ax in grid[-1]:
+        ax.set_xlabel("step")
+    return figure
+
+
+def std_histories(axis: AxisDeviation) -> Figure:
+    """Draw the standard deviations of u in three directions and of the strain against the step, at three heights."""
+    figure, axes = new_figure(11.5, 2.8, 4)
+    for level, colour in zip(_three_levels(axis), (BLUE, ORANGE, GREEN), strict=False):
+        for ax, std in zip(axes, _at(axis.std, axis.strain_std, level), strict=True):
+            ax.plot(std, color=colour, linewidth=1.6, marker=_marker(std), label=f"z = {axis.level_mm[level]:.2f} mm")
+    for ax, title in zip(axes, QUANTITIES, strict=True):
+        ax.set_title(title, fontsize=10)
+        ax.set_xlabel("step")
+        ax.set_ylim(bottom=0)
+        _tidy(ax)
+    axes[0].set_ylabel("standard deviation")
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, ncols=3, loc="outside lower center")
+    return figure
+
+
+def std_maps(axis: AxisDeviation) -> Figure:
+    """Draw the standard deviations of u in three directions and of the strain over step and height."""
+    figure, axes = new_figure(15, 3.3, 4)
+    steps = np.arange(len(axis.std) + 1) - 0.5
+    fields = [axis.std[..., k] for k in range(3)] + [axis.strain_std * 100]
+    edges = [_edges(axis.level_mm)] * 3 + [axis.level_mm]
+    for ax, title, field, heights in zip(axes, QUANTITIES, fields, edges, strict=True):
+        # a few steps, the last ones above all, would take up the whole scale
+        known = field[np.isfinite(field)]
+        high = float(np.quantile(known, 0.98)) if known.size else 1.0
+        mesh = ax.pcolormesh(steps, heights, field.T, cmap="viridis", vmin=0, vmax=high)
+        ax.set_facecolor(UNOBSERVED)
+        ax.set_title(title, fontsize=10)
+        ax.set_xlabel("step")
+        ax.figure.colorbar(mesh, ax=ax, extend="max" if known.size and known.max() > high else "neither")
+    for ax in axes:
+        ax.set_ylim(axis.level_mm[0], axis.level_mm[-1])
+    axes[0].set_ylabel("height on the axis (mm)")
+    return figure
+
+
+def _three_levels(axis: AxisDeviation) -> list[int]:
+    """Return a high, a middle and a low level among those most often observed, from the top down."""
+    count = np.isfinite(axis.strain_std).sum(axis=0)
+    usual = np.flatnonzero(count == count.max())
+    return sorted({int(usual[round(share * (len(usual) - 1))]) for share in (5 / 6, 1 / 2, 1 / 6)}, reverse=True)
+
+
+def _at(directions: Floats, strain: Floats, level: int) -> list[Floats]:
+    """Return four histories (step,): u in three directions at a level, voxels, and the strain above it, %."""
+    return [*directions[:, level].T, strain[:, level] * 100]
 
 
 def _edges(level_mm: Floats) -> Floats:

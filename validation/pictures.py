@@ -15,6 +15,7 @@ from pdvc.measurement import Measurement
 from pdvc.radiographs import calibrate, grey_levels
 from validation import figures as draw
 from validation.axis import AxisHistory, TruePoints, axis_history, nan_mean
+from validation.axis_deviation import axis_deviation
 from validation.noise_floor import NoiseFloor, noise_floor
 from validation.scores import point_errors
 
@@ -42,6 +43,7 @@ def pictures(measurement: Measurement, experiment: Experiment | None, truth: Tru
     result += [_translations(axis), _snr(measurement), *_maps(axis)]
     if truth is not None:
         result.append(_errors(measurement, truth))
+    result += _deviations(measurement, truth)
     floor = noise_floor(measurement, truth)
     if floor is not None:
         result.append(_noise_floor(floor))
@@ -190,6 +192,33 @@ def _errors(measurement: Measurement, truth: TruePoints) -> Picture:
         ),
         figure=figure,
     )
+
+
+def _deviations(measurement: Measurement, truth: TruePoints | None) -> list[Picture]:
+    at_sections = axis_deviation(measurement)
+    if truth is None:
+        histories = Picture(
+            name="uncertainty_histories",
+            caption="Standard deviation at three sections on the axis, from noise and prior; that of the strain holds "
+            "between the section and the next.",
+            figure=draw.std_histories(at_sections),
+        )
+    else:
+        histories = Picture(
+            name="uncertainty_bands",
+            caption="Error on the axis, measured less true, at three heights of the material at rest. Band: two "
+            "standard deviations, from noise and prior, on either side; where they are right, it holds zero at 95 % "
+            "of the steps. Strain: between that height and the next.",
+            figure=draw.error_bands(axis_deviation(measurement, truth)),
+        )
+    maps = Picture(
+        name="uncertainty_maps",
+        caption="Standard deviation, from noise and prior, on the axis at each section; of the strain, between "
+        "neighbouring sections. Each map has its own scale; the largest 2 % of its values lie beyond it. Grey: not "
+        "observed.",
+        figure=draw.std_maps(at_sections),
+    )
+    return [histories, maps]
 
 
 def _noise_floor(floor: NoiseFloor) -> Picture:

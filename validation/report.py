@@ -16,6 +16,7 @@ from validation.axis import TruePoints, axis_history, nan_mean
 from validation.noise_floor import LEAST_STEPS, NoiseFloor, noise_floor
 from validation.pictures import of_volumes, pictures
 from validation.scores import Directions, Scores, mean_snr, modes_found
+from validation.trust import calibration_sentences, nees_sentence, noise_known, residual_sentences, trust_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +73,12 @@ def _page(
         scores=scores,
         rows=summary_rows(measurement, scores),
         errors=_error_table(scores, measurement.voxel_mm * 1e3) if scores else [],
+        trust=trust_table(scores) if scores else [],
+        nees=nees_sentence(scores.calibration) if scores else "",
+        calibration=calibration_sentences(measurement, scores, truth) if scores else [],
+        residual=residual_sentences(
+            measurement.residual_tests, noise_known=noise_known(measurement), truth_known=scores is not None
+        ),
         pictures=shown,
         floor=floor,
         floor_lines=_floor_table(floor, scores) if floor else [],
