@@ -111,7 +111,8 @@ def grey_noise(counts: NDArray[np.uint16], calibration: Calibration, noise: Dete
     attenuation = np.log(calibration.open_beam / signal)
     slope = c1 + attenuation * (2 * c2 + 3 * c3 * attenuation)
     variance = slope**2 * noise.relative_variance(signal)
-    return fill(np.asarray(variance, dtype=np.float32), calibration.bad), np.asarray(slope, dtype=np.float32)
+    # a dead pixel's counts tell neither: its neighbours' mean stands for both, as for its grey level
+    return fill(np.asarray(variance, dtype=np.float32), calibration.bad), fill(slope, calibration.bad)
 
 
 def fill(image: Image, bad: NDArray[np.bool_]) -> Image:
