@@ -29,7 +29,7 @@ QUIET = settings(max_examples=100, deadline=None, derandomize=True, database=Non
 def test_scenarios_are_small_never_square_and_begin_with_a_turn_at_constant_load(scenario):
     plan, geometry = scenario.acquisition, scenario.geometry
     assert geometry.rows != geometry.columns
-    assert geometry.rows * geometry.columns <= 40 * 84
+    assert geometry.rows * geometry.columns <= 84 * 48
     assert plan.reference_views <= 48
     assert plan.test_steps <= 24
     force = course_of(scenario).history.force_N
@@ -48,7 +48,7 @@ def test_scenarios_shrink_to_a_sample_at_rest_seen_by_the_smallest_detector():
     plain = find(scenarios(), lambda scenario: scenario.seed >= 3, settings=QUIET)
     assert plain.seed == 3
     assert plain.motion.ingredients == ()
-    assert plain.geometry.columns == 32
+    assert plain.geometry.columns == 42
     assert plain.geometry.roll_deg == plain.geometry.row_shift_mm == plain.acquisition.start_deg == 0
 
 

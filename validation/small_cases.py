@@ -41,9 +41,9 @@ Floats = NDArray[np.float64]
 _SMALL = """{
     "name": "small-case",
     "title": "In situ tension of cast iron, small enough for a test",
-    "discarded_rows": 8,
+    "discarded_rows": 12,
     "graphite": {"mean_diameter_mm": 0.35, "smallest_diameter_mm": 0.2, "largest_diameter_mm": 0.6, "gap_mm": 0.02},
-    "geometry": {"pixel_mm": 3.6, "rows": 72, "columns": 34},
+    "geometry": {"pixel_mm": 3.6, "rows": 76, "columns": 44},
     "acquisition": {"reference_views": 40, "test_steps": 18, "steps_per_turn": 10, "subpixels": 2},
     "loading": {"plateau_steps": 10, "stroke_mm_per_s": 0.018, "necking_steps": 3}
 }"""
@@ -68,9 +68,11 @@ def small_scenario(changes: Mapping[str, Any] | None = None) -> Scenario:
 def small_options(scenario: Scenario) -> MeasureOptions:
     """Return a protocol that measures a small scenario: four sections, Table 1 with its kink at the start of loading.
 
-    Direct solves are repeated until a change is below a thousandth of a voxel.
+    Direct solves are repeated until a change is below a thousandth of a voxel. Rows are left out as the scenario says:
+    with the usual tenth of so few, rays of the used ones would leave the volume through its top and bottom.
     """
     return MeasureOptions(
+        discard_rows=scenario.discarded_rows,
         sections=4,
         section_motions=RIGID,
         time=(*PAPER[:3], Ramp(start=scenario.loading.plateau_steps, powers=(1, 2))),
