@@ -53,18 +53,18 @@ def posterior(equations: Equations, time_functions: Floats, prior: Prior, noise:
     """
     shape = prior.deviation_voxel.shape
     steps = time_functions.shape[1]
-    ridge, precision = prior.ridge(equations.rms), prior.precision()
-    gamma2 = max(equations.rms, LEAST_RMS) ** 2
+    precision = prior.precision()
     if separate(time_functions):
-        scale = (time_functions**2).sum(axis=1)
-        matrices = [s * equations.matrix[np.argmax(f != 0)] for s, f in zip(scale, time_functions, strict=True)]
-        noises = [gamma2 * matrix for matrix in matrices] if noise is None else list(noise)
-        covariance = np.stack([sandwich(m, v, ridge, gamma2) for m, v in zip(matrices, noises, strict=True)])
-    else:
-        matrix = hessian(equations.matrix, time_functions)
-        covariance = sandwich(
-            matrix, gamma2 * matrix if noise is None else noise, np.tile(ridge, len(time_functions)), gamma2
+        covariance = np.stack(
+            [
+                _of_one_step(equations, f, precision, None if noise is None else noise[k])
+                for k, f in enumerate(time_functions)
+            ]
         )
+    else:
+        matrix, gamma2 = hessian(equations.matrix, time_functions), max(equations.rms, LEAST_RMS) ** 2
+        ridge = np.tile(prior.ridge(equations.rms), len(time_functions))
+        covariance = sandwich(matrix, gamma2 * matrix if noise is None else noise, ridge, gamma2)
     variance = np.stack([np.diag(step_covariance(covariance, time_functions, t)) for t in range(steps)])
     before = (time_functions**2).sum(axis=0)[:, None] / precision
     information = np.einsum("tnn->n", equations.matrix).reshape(shape).sum(axis=1)
@@ -74,6 +74,15 @@ def posterior(equations: Equations, time_functions: Floats, prior: Prior, noise:
         data_share=np.clip(1 - variance / before, 0, 1).reshape(steps, *shape),
         observed=information > UNSEEN * np.median(information),
     )
+
+
+def _of_one_step(equations: Equations, function: Floats, precision: Floats, noise: Floats | None) -> Floats:
+    """Return C of the coefficients of a function (step,) that is alone at its step: the residual is that step's."""
+    step = int(np.argmax(function != 0))
+    pixels = equations.pixels / len(equations.chi2)
+    gamma2 = max(float(equations.chi2[step]) / pixels, LEAST_RMS**2)
+    matrix = function[step] ** 2 * equations.matrix[step]
+    return sandwich(matrix, gamma2 * matrix if noise is None else noise, gamma2 * precision, gamma2)
 
 
 def by_source(
