@@ -23,7 +23,7 @@ def motion(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "command", ["scenarios", "options", "simulate", "measure", "score", "report", "run", "studies", "study"]
+    "command", ["scenarios", "options", "simulate", "measure", "score", "report", "run", "studies", "study", "compare"]
 )
 def test_every_command_explains_itself(command):
     assert command in pdvc_bench("--help").stdout

@@ -257,6 +257,11 @@ def broken(experiment):
     """Assume too much."""
     note("broken", experiment)
     raise ValueError("radiographs: expected other ones,\\n found these")
+
+
+def wrong(experiment):
+    """Assume that a number will do."""
+    return 7
 '''
 
 
@@ -264,10 +269,10 @@ def broken(experiment):
 def done(tmp_path_factory):
     """Compare three made-up methods as a user does it, twice; the tests below look at what that left."""
     folder = tmp_path_factory.mktemp("compare")
-    methods = {name: f"made_up_methods:{name}" for name in ("every", "few", "broken")}
+    methods = {name: f"made_up_methods:{name}" for name in ("every", "few", "broken", "wrong")}
     install(folder, methods, MODULE, name="made_up_methods")
     (folder / "tiny.toml").write_text(SMALL)
-    arguments = ("compare", folder / "tiny.toml", "--methods", "every,few,broken", "-o", folder / "out")
+    arguments = ("compare", folder / "tiny.toml", "--methods", "every,few,broken,wrong", "-o", folder / "out")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
         patch.setenv("PDVC_TEST_DIARY", str(folder))
@@ -297,12 +302,13 @@ def test_the_table_has_a_row_for_each_method_and_a_failure_is_one_of_them(done):
     out, first, _, _, _ = done
     with (out / "methods.csv").open() as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
-    assert list(rows) == ["every", "few", "broken"]
-    assert [row["steps_measured"] for row in rows.values()] == ["14", "3", "0"]
+    assert list(rows) == ["every", "few", "broken", "wrong"]
+    assert [row["steps_measured"] for row in rows.values()] == ["14", "3", "0", "0"]
     assert {row["steps_common"] for row in rows.values()} == {"3"}
     assert rows["every"]["radiographs"] == str(36 + 14)
     assert rows["few"]["radiographs"] == str(36 * 4)
     assert rows["broken"]["reason"] == "ValueError: radiographs: expected other ones, found these"
+    assert rows["wrong"]["reason"] == "ValueError: method 'wrong': expected it to return a Measurement, got int"
     assert rows["broken"]["failed"] == "2"
     # the same estimate at the same steps is the same error; over all steps it is another
     assert rows["every"]["error_vertical"] == rows["few"]["error_vertical"]
@@ -360,6 +366,15 @@ def test_an_unknown_method_is_answered_before_any_work(tmp_path):
     result = pdvc_bench("compare", "quick", "--methods", "pgd,gauss-newtn", "-o", tmp_path / "out")
     assert result.exit_code == 2
     assert "did you mean 'gauss-newton'?" in only_line(result)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_method_that_cannot_be_used_here_is_answered_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    result = pdvc_bench("compare", "quick", "--methods", "pgd,spam", "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert only_line(result).startswith("error: method 'spam': expected the program spam-reg, found none: pip install")
     assert not (tmp_path / "out").exists()
 
 

@@ -26,7 +26,7 @@ app = typer.Typer(
 
     A **scenario** describes an experiment whose truth is known; **simulate** carries it out; **measure**
     recovers the motion from the radiographs alone; **score** compares both; **run** does all in turn. A
-    **study** runs many and varies what they have.
+    **study** runs many and varies what they have; **compare** lets several methods measure the same.
 
     Start with:  `pdvc-bench run quick -o out/quick`
 
