@@ -47,18 +47,10 @@ SHORTER = (1.0, 0.5, 0.25)
 """Shares of a change that are tried in turn, until one lowers what is minimised."""
 
 
-def lowers(
-    now: Equations,
-    coefficients: Floats,
-    trial: Equations,
-    moved: Floats,
-    prior: Prior,
-    steps: NDArray[np.intp] | slice = slice(None),
-) -> bool:
-    """Return whether chi2 + rms^2 sum (amplitude / deviation)^2 falls over some steps, with rms that of `now`.
+def lowers(now: Equations, coefficients: Floats, trial: Equations, moved: Floats, prior: Prior) -> bool:
+    """Return whether chi2 + rms^2 sum (amplitude / deviation)^2 falls, with rms that of `now`.
 
-    `coefficients` and `moved` (function, section * motion) belong to `now` and `trial`: those of the functions that
-    are not zero there.
+    `coefficients` and `moved` (function, section * motion) belong to `now` and `trial`.
     """
     believed = now.rms**2 * float((prior.precision() * (moved**2 - coefficients**2)).sum())
-    return bool(trial.chi2[steps].sum() + believed < now.chi2[steps].sum())
+    return bool(trial.chi2.sum() + believed < now.chi2.sum())

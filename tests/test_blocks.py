@@ -36,7 +36,7 @@ def groups_of(labels, seed):
 @given(st.lists(st.integers(0, 3), min_size=9, max_size=9), st.integers(0, 10**6))
 @settings(deadline=None, max_examples=30)
 def test_blocks_give_the_dense_solution(labels, seed):
-    """One pass on a linear problem from any start, against numpy's solve of the whole system with the prior."""
+    """One pass on a linear problem, against numpy's solve of the whole system with each block's own prior."""
     equations, functions = random_equations(seed, shape=SHAPE), groups_of(labels, seed)
     blocks = blocks_of(functions)
     assert len(blocks) == len(set(labels))
@@ -51,9 +51,34 @@ def test_blocks_give_the_dense_solution(labels, seed):
         least_change_voxel=1e-12,
     )
     matrix = sum(np.kron(np.outer(functions[:, t], functions[:, t]), equations.matrix[t]) for t in range(9))
-    matrix += equations.rms**2 / deviation**2 * np.eye(len(matrix))
+    for block in blocks:
+        mean_square = equations.chi2[block.steps].sum() / (equations.pixels * len(block.steps) / 9)
+        for function in block.functions:
+            matrix[np.diag_indices_from(matrix)] += np.repeat(np.arange(len(functions)) == function, 6) * (
+                mean_square / deviation**2
+            )
     vector = sum(np.kron(functions[:, t], equations.vector[t]) for t in range(9))
     np.testing.assert_allclose(found.coefficients.ravel(), np.linalg.solve(matrix, vector), rtol=1e-6, atol=1e-9)
+
+
+def test_what_is_found_at_a_step_does_not_depend_on_the_others():
+    """A strong prior, which is weighed against the residual: that of the step alone."""
+    equations = random_equations(7, shape=SHAPE)
+    louder = replace(equations, chi2=equations.chi2 * np.where(np.arange(9) == 3, 1.0, 50.0))
+    believed = Prior(deviation_voxel=np.full(SHAPE, 0.05))
+    found = [
+        gauss_newton.solve(
+            linear_model(each, 3 * np.eye(9), SHAPE),
+            3 * np.eye(9),
+            np.zeros((9, *SHAPE)),
+            believed,
+            most_passes=1,
+            least_change_voxel=1e-9,
+        ).coefficients
+        for each in (equations, louder)
+    ]
+    np.testing.assert_array_equal(found[0][3], found[1][3])
+    assert (np.abs(found[0][4] - found[1][4]) > 1e-6).all()
 
 
 def test_linked_functions_are_one_block():
