@@ -31,7 +31,7 @@ def test_scenarios_are_small_never_square_and_begin_with_a_turn_at_constant_load
     assert geometry.rows != geometry.columns
     assert geometry.rows * geometry.columns <= 84 * 48
     assert plan.reference_views <= 48
-    assert plan.test_steps <= 24
+    assert 18 <= plan.test_steps <= 24
     force = course_of(scenario).history.force_N
     np.testing.assert_array_equal(force[: plan.steps_per_turn], scenario.loading.plateau_N)
     assert (np.diff(force[plan.steps_per_turn - 1 :]) > 0)[1:].all()
