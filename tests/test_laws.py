@@ -46,7 +46,7 @@ THROUGH = settings(
     phases=[Phase.generate],
 )
 """A law through the whole pipeline costs some two seconds an example: one here, and as many as asked for by hand."""
-QUICK = settings(max_examples=10, deadline=None, derandomize=True)
+QUICK = settings(max_examples=6, deadline=None, derandomize=True)
 
 moving_experiments = small_experiments(least_ingredients=5)
 moving_cases = projected_cases().filter(lambda case: np.count_nonzero(case.coefficients) >= 5)

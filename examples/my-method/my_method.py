@@ -1,0 +1,23 @@
+"""A method of one's own: a function from an Experiment to a Measurement, announced in pyproject.toml beside it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pdvc.experiment import Experiment
+from pdvc.history import Force, Polynomial
+from pdvc.measure import measure
+from pdvc.measurement import Measurement
+from pdvc.options import MeasureOptions
+
+
+def follows_force(experiment: Experiment) -> Measurement:
+    """Assume that the sample moves in proportion to the force, and by a shift before the test, but not with the stage.
+
+    Pages of `pdvc-bench compare` print the paragraph above. Anything that takes an Experiment and fills in a
+    Measurement is a method; this one leaves most to `measure`, and hands it a force freed of its noise, by a median
+    over five steps.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(experiment.test.force_N, 2, mode="edge"), 5)
+    quiet = replace(experiment, test=replace(experiment.test, force_N=np.median(windows, axis=1)))
+    return measure(quiet, MeasureOptions(time=(Force(), Polynomial(degree=0)), sections=6))
