@@ -1,9 +1,9 @@
 """Efficiency of the weighted direct solve on `in-space`, and what the rest is: python -m benchmarks.efficiency.
 
 For each noise: the Cramer-Rao bound; what the standard deviation would be if only the radiographs of the test were
-noisy, then with the noise of the reference views, then with that of the flats, which is what the measurement states;
-and the scatter over noise draws, and the bias that they leave. All in voxels, rms over material points and steps.
-Efficiency is bound over scatter. Some 4 minutes on 2 cores.
+noisy, then with the noise of the reference views, then with that of the flats, which is what the measurement states
+(the shares are those on the axis, at the sections); and the scatter over noise draws, and the bias that they leave. All
+in voxels, rms over material points and steps. Efficiency is bound over scatter. Some 4 minutes on 2 cores.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from pdvc.options import MeasureOptions, StageOptions
 from pdvc.sections import RIGID
 from simulator.scenario import load_scenario
 from validation.bound import bound_of
+from validation.calibration import calibration
 from validation.scores import point_errors
 from validation.summary import estimates
 from validation.trial import simulated
@@ -43,30 +44,30 @@ def main() -> None:
     base = load_scenario("in-space")
     with tempfile.TemporaryDirectory() as name:
         shared = Path(name)
-        for photons, readout in ((1e3, 30.0), (2e4, 30.0), (base.detector.photons_per_pixel, 3.0)):
+        for photons, readout in ((1e3, 30.0), (base.detector.photons_per_pixel, base.detector.readout_noise_counts)):
             detector = base.detector.model_copy(update={"photons_per_pixel": photons, "readout_noise_counts": readout})
             scenario = base.model_copy(update={"detector": detector})
             bound, truth = bound_of(scenario, OPTIONS, shared / "clean")
-            errors, sources = [], []
+            errors, sources, stated = [], [], []
             for repetition in range(DRAWS):
                 with simulated(scenario.model_copy(update={"repetition": repetition}), shared) as (experiment, _, _):
                     found = measure(experiment, OPTIONS)
                     errors.append(point_errors(found, truth).components)
                     sources.append(found.std_by_source)
+                    stated.append(asdict(calibration(found, truth, errors[-1]).predicted))
             least = asdict(bound.quantities(truth))
             for k, direction in enumerate(("across_beam", "vertical", "along_beam")):
-                part = {
-                    source: np.sqrt(np.mean([each[source][k] ** 2 for each in sources]))
-                    for source in ("radiographs", "views", "flats")
-                }
+                predicted = np.sqrt(np.mean([each[direction] ** 2 for each in stated]))
+                square = {name: np.mean([each[name][k] ** 2 for each in sources]) for name in sources[0]}
+                scale = predicted / np.sqrt(sum(square.values()))
                 seen = estimates([each[..., k] for each in errors])
                 row: Row = {
                     "photons": f"{photons:.0e}",
                     "direction": direction.replace("_", " "),
                     "bound": f"{least[direction]:.5f}",
-                    "radiographs": f"{part['radiographs']:.5f}",
-                    "and views": f"{np.hypot(part['radiographs'], part['views']):.5f}",
-                    "and flats": f"{np.sqrt(sum(value**2 for value in part.values())):.5f}",
+                    "radiographs": f"{scale * np.sqrt(square['radiographs']):.5f}",
+                    "and views": f"{scale * np.sqrt(square['radiographs'] + square['views']):.5f}",
+                    "and flats": f"{predicted:.5f}",
                     "scatter": f"{seen['random'].value:.5f}",
                     "bias": f"{seen['bias'].value:.5f}",
                     "efficiency": f"{least[direction] / seen['random'].value:.2f}",
