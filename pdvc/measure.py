@@ -31,7 +31,7 @@ from pdvc.progress import Progress, silent
 from pdvc.sections import SectionBasis
 from pdvc.solution import Solution
 from pdvc.store import Store
-from pdvc.uncertainty import by_source, posterior
+from pdvc.uncertainty import posterior
 
 __all__ = ["MeasureOptions", "StageOptions", "measure"]
 
@@ -86,9 +86,8 @@ def measure(
         equations.residual,
         progress=progress,
     )
-    known = posterior(equations, time_functions, _prior(sections, options), propagated.covariance)
+    known = posterior(equations, time_functions, _prior(sections, options), propagated.parts)
     amplitude[:, ~known.observed] = np.nan
-    sources = by_source(equations, time_functions, _prior(sections, options), propagated.parts)
     snr = snr_of(fine.images)
     ended = time.perf_counter()
     return Measurement(
@@ -118,7 +117,7 @@ def measure(
         residual_tests=propagated.tests,
         std_by_source={
             name: _on_the_axis(part, sections, known.observed, time_functions, experiment.test.angle_rad)
-            for name, part in sources.items()
+            for name, part in known.by_source.items()
         },
         seconds={
             "compile": started - compiling,

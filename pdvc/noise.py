@@ -225,15 +225,8 @@ def _add(pairs: dict[tuple[int, int], Floats], key: tuple[int, int], block: Floa
 def product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns: int) -> Floats:
     """Return sum_p one(p)^T v(p) other(p), (unknown, unknown), of two fields with variances v (row, column)."""
     result = np.zeros((unknowns, unknowns))
-    firsts = np.stack([one.first, other.first])
-    # rows that touch the same sections are multiplied together
-    for a, b in np.unique(firsts, axis=1).T:
-        rows = (firsts[0] == a) & (firsts[1] == b)
-        left = (one.values[rows] * variance[rows][..., None]).reshape(-1, one.values.shape[2])
-        block = left.T @ other.values[rows].reshape(-1, other.values.shape[2])
-        i, j = int(a) * one.motions, int(b) * other.motions
-        height, width = min(block.shape[0], unknowns - i), min(block.shape[1], unknowns - j)
-        result[i : i + height, j : j + width] += block[:height, :width]
+    offsets = one.first * one.motions, other.first * other.motions
+    _add_product(one.values, offsets[0], other.values, offsets[1], variance, result)
     return result
 
 
@@ -405,6 +398,27 @@ def _spread(field: Sensitivities, places: Floats, shape: tuple[int, ...]) -> Sen
     values = np.zeros((*shape, max(int((high - low).max()), 1) * field.motions), dtype=np.float32)
     _scatter(field.values, (field.first[:, None] - low) * field.motions, places, values)
     return Sensitivities(values=values, first=low, motions=field.motions)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
+def _add_product(one, first, other, second, variance, out):  # type: ignore[no-untyped-def]
+    """Add v one^T other of each pixel to `out`; `first` and `second` (row,) are where a row's values belong there.
+
+    A row may have room for sections beyond the last: these are left out.
+    """
+    for row in range(one.shape[0]):
+        i0, j0 = first[row], second[row]
+        height, width = min(one.shape[2], out.shape[0] - i0), min(other.shape[2], out.shape[1] - j0)
+        part = np.zeros((height, width))
+        for column in range(one.shape[1]):
+            for i in range(height):
+                w = variance[row, column] * one[row, column, i]
+                if w != 0:
+                    for j in range(width):
+                        part[i, j] += w * other[row, column, j]
+        for i in range(height):
+            for j in range(width):
+                out[i0 + i, j0 + j] += part[i, j]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

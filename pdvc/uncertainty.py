@@ -38,6 +38,8 @@ class Posterior:
     covariance: Floats
     """C (function * unknown, function * unknown), voxel^2, with unknown = section * motion; or (function, unknown,
     unknown), where each step has a function of its own and nothing joins them."""
+    by_source: dict[str, Floats]
+    """What each part of the noise, and the prior, add to C; empty where nothing joins the functions."""
     deviation: Floats
     """Standard deviations (step, section, motion), voxels."""
     data_share: Floats
@@ -46,30 +48,40 @@ class Posterior:
     """(section,)"""
 
 
-def posterior(equations: Equations, time_functions: Floats, prior: Prior, noise: Floats | None = None) -> Posterior:
+def posterior(
+    equations: Equations, time_functions: Floats, prior: Prior, noise: Mapping[str, Floats] | None = None
+) -> Posterior:
     """Return what noise and prior leave uncertain.
 
-    `noise` is V (noise.Propagated.covariance); without it residuals are taken as white, of the observed size.
+    `noise` are the parts of V (noise.Propagated.parts); without it residuals are taken as white, of the observed size.
     """
     shape = prior.deviation_voxel.shape
     steps = time_functions.shape[1]
     precision = prior.precision()
+    by_source: dict[str, Floats] = {}
     if separate(time_functions):
+        parts = None if noise is None else np.sum(list(noise.values()), axis=0)
         covariance = np.stack(
             [
-                _of_one_step(equations, f, precision, None if noise is None else noise[k])
+                _of_one_step(equations, f, precision, None if parts is None else parts[k])
                 for k, f in enumerate(time_functions)
             ]
         )
     else:
         matrix, gamma2 = hessian(equations.matrix, time_functions), max(equations.rms, LEAST_RMS) ** 2
         ridge = np.tile(prior.ridge(equations.rms), len(time_functions))
-        covariance = sandwich(matrix, gamma2 * matrix if noise is None else noise, ridge, gamma2)
+        inverse = solved(matrix + np.diag(ridge), np.eye(len(matrix)))
+        for name, part in ({"residual": gamma2 * matrix} if noise is None else noise).items():
+            by_source[name] = inverse @ part @ inverse
+        by_source["prior"] = (inverse * (gamma2 * ridge)) @ inverse
+        covariance = np.sum(list(by_source.values()), axis=0)
+        covariance = (covariance + covariance.T) / 2
     variance = np.stack([np.diag(step_covariance(covariance, time_functions, t)) for t in range(steps)])
     before = (time_functions**2).sum(axis=0)[:, None] / precision
     information = np.einsum("tnn->n", equations.matrix).reshape(shape).sum(axis=1)
     return Posterior(
         covariance=covariance,
+        by_source=by_source,
         deviation=np.sqrt(np.maximum(variance, 0)).reshape(steps, *shape),
         data_share=np.clip(1 - variance / before, 0, 1).reshape(steps, *shape),
         observed=information > UNSEEN * np.median(information),
@@ -83,22 +95,6 @@ def _of_one_step(equations: Equations, function: Floats, precision: Floats, nois
     gamma2 = max(float(equations.chi2[step]) / pixels, LEAST_RMS**2)
     matrix = function[step] ** 2 * equations.matrix[step]
     return sandwich(matrix, gamma2 * matrix if noise is None else noise, gamma2 * precision, gamma2)
-
-
-def by_source(
-    equations: Equations, time_functions: Floats, prior: Prior, parts: Mapping[str, Floats]
-) -> dict[str, Floats]:
-    """Return what each source of noise (noise.Propagated.parts), and the prior, add to the covariance C.
-
-    Empty where each step has a function of its own.
-    """
-    if separate(time_functions):
-        return {}
-    matrix = hessian(equations.matrix, time_functions)
-    ridge = np.tile(prior.ridge(equations.rms), len(time_functions))
-    found = {name: sandwich(matrix, part, ridge, 0.0) for name, part in parts.items()}
-    gamma2 = max(equations.rms, LEAST_RMS) ** 2
-    return {**found, "prior": sandwich(matrix, np.zeros_like(matrix), ridge, gamma2)}
 
 
 def sandwich(matrix: Floats, noise: Floats, ridge: Floats, gamma2: float) -> Floats:

@@ -14,7 +14,7 @@ from pdvc.projection import sensitivities
 from pdvc.radiographs import smoothed
 from pdvc.rays import ray_vectors
 from pdvc.systematic import Systematic
-from pdvc.uncertainty import by_source, posterior
+from pdvc.uncertainty import posterior
 from tests.small_case import ANGLES, SCANNER, SECTIONS, SHAPE, STEPS, VOXEL_MM, motion, radiographs, time_functions
 
 UNKNOWNS = SECTIONS.shape[0] * SECTIONS.shape[1]
@@ -184,7 +184,7 @@ def test_more_noise_makes_every_amplitude_less_known():
     equations = linearise(images, SECTIONS, AMPLITUDE)
     believed = Prior(deviation_voxel=np.full(SECTIONS.shape, 30.0))
     quiet, loud = (
-        posterior(equations, time_functions(), believed, propagated(noise(*levels), systematic())).deviation
+        posterior(equations, time_functions(), believed, {"all": propagated(noise(*levels), systematic())}).deviation
         for levels in ((1e-3, 1e-3, 1e-3), (1e-3, 2e-3, 1e-3))
     )
     assert (loud > quiet).all()
@@ -195,8 +195,10 @@ def test_the_sources_add_up_to_the_whole_covariance():
     equations = replace(linearise(images, SECTIONS, AMPLITUDE), chi2=np.full(STEPS, SHAPE[0] * SHAPE[1] * 1e-4))
     believed = Prior(deviation_voxel=np.full(SECTIONS.shape, 0.05))
     found = propagate(images, systematic(), SECTIONS, AMPLITUDE, time_functions(), noise(), nothing)
-    whole = posterior(equations, time_functions(), believed, found.covariance).covariance
-    sources = by_source(equations, time_functions(), believed, found.parts)
+    known = posterior(equations, time_functions(), believed, found.parts)
+    whole, sources = known.covariance, known.by_source
+    expected = posterior(equations, time_functions(), believed, {"all": found.covariance}).covariance
+    np.testing.assert_allclose(whole, expected, rtol=1e-6, atol=1e-9 * whole.max())
     assert set(sources) == {"radiographs", "views", "flats", "prior"}
     np.testing.assert_allclose(sum(sources.values()), whole, rtol=1e-6, atol=1e-9 * whole.max())
     # each of them matters here, so that none is lost unseen

@@ -100,7 +100,9 @@ def true_coefficients(
     amplitude = np.empty((len(positions), *basis.shape))
     for step, (x, here) in enumerate(zip(positions, inside, strict=True)):
         shapes = basis.shapes(x[here]).reshape(3 * int(here.sum()), -1)
-        amplitude[step] = np.linalg.lstsq(shapes, true[step, here].ravel(), rcond=1e-9)[0].reshape(basis.shape)
+        amplitude[step] = linalg.lstsq(shapes, true[step, here].ravel(), cond=1e-9, lapack_driver="gelsy")[0].reshape(
+            basis.shape
+        )
     norm = (time_functions**2).sum(axis=1)
     coefficients = np.einsum("ft,tjk->fjk", time_functions, amplitude) / norm[:, None, None]
     made = np.einsum("ft,fjk->tjk", time_functions, coefficients)
