@@ -72,10 +72,10 @@ def posterior(
         ridge = np.tile(prior.ridge(equations.rms), len(time_functions))
         inverse = solved(matrix + np.diag(ridge), np.eye(len(matrix)))
         for name, part in ({"residual": gamma2 * matrix} if noise is None else noise).items():
-            by_source[name] = inverse @ part @ inverse
+            whole = inverse @ part @ inverse
+            by_source[name] = (whole + whole.T) / 2
         by_source["prior"] = (inverse * (gamma2 * ridge)) @ inverse
         covariance = np.sum(list(by_source.values()), axis=0)
-        covariance = (covariance + covariance.T) / 2
     variance = np.stack([np.diag(step_covariance(covariance, time_functions, t)) for t in range(steps)])
     before = (time_functions**2).sum(axis=0)[:, None] / precision
     information = np.einsum("tnn->n", equations.matrix).reshape(shape).sum(axis=1)
