@@ -38,7 +38,7 @@ from pdvc.store import Store
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
 from simulator.truth import read_truth
-from validation.axis import TruePoints, current_positions
+from validation.axis import TruePoints, current_positions, points_on_axis
 from validation.calibration import Quantities, true_coefficients
 
 Floats = NDArray[np.float64]
@@ -60,17 +60,22 @@ class Bound:
     """As of Measurement."""
 
     def quantities(self, truth: TruePoints) -> Quantities:
-        """Return rms standard deviations over steps and material points between the sections; strain on the axis."""
+        """Return rms standard deviations over steps and material points between the sections.
+
+        The strain is that of the scores: between material levels of the axis, about a section apart.
+        """
         positions = current_positions(truth)
         low, high = self.basis.height_mm[[0, -1]]
+        axis = points_on_axis(truth.point_mm, float(np.mean(np.diff(self.basis.height_mm))))
         turned, strain = [], []
-        spacing = float(np.mean(np.diff(self.basis.height_mm)))
-        levels = np.arange(low, high + 1e-9, spacing)
         for step, x in enumerate(positions):
             covariance = step_covariance(self.covariance, self.time_functions, step)
-            inside = x[(x[:, 2] >= low) & (x[:, 2] <= high)]
-            turned.append(turned_std(self.basis, covariance, float(self.angle_rad[step]), inside))
-            strain.append(strain_std(self.basis, covariance, levels, self.voxel_mm))
+            inside = (x[:, 2] >= low) & (x[:, 2] <= high)
+            turned.append(turned_std(self.basis, covariance, float(self.angle_rad[step]), x[inside]))
+            levels = axis[inside[axis]]
+            now, before = x[levels, 2], truth.point_mm[levels, 2]
+            stretched = np.diff(now) / np.diff(before)
+            strain.append(strain_std(self.basis, covariance, now, self.voxel_mm) * stretched)
         across, vertical, along = np.sqrt((np.concatenate(turned) ** 2).mean(axis=0)).tolist()
         of_strain = float(np.sqrt((np.concatenate(strain) ** 2).mean()))
         return Quantities(across_beam=across, vertical=vertical, along_beam=along, strain=of_strain)
