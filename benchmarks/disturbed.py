@@ -44,6 +44,12 @@ def rows(out: Path) -> int:
     return len(list((out / "runs").glob("*.parquet")))
 
 
+def pace(out: Path) -> float:
+    """Return the runs per second between the first row and the last: start and end of the study left out."""
+    stamps = sorted(path.stat().st_mtime for path in (out / "runs").glob("*.parquet"))
+    return (len(stamps) - 1) / (stamps[-1] - stamps[0])
+
+
 def wait_for(out: Path, count: int) -> None:
     """Wait until so many runs are on disk."""
     while rows(out) < count:
@@ -95,6 +101,7 @@ def main() -> None:
             "seconds of 40 runs, 1 worker": f"{one:.0f}",
             "2 workers": f"{two:.0f}",
             "scaling": f"{one / two:.2f}",
+            "scaling of the runs alone": f"{pace(folder / 'workers-2') / pace(folder / 'workers-1'):.2f}",
         }
         show(found)
         keep([found], "disturbed")
