@@ -45,3 +45,8 @@ bench: .venv-bench/.installed
 	echo '*' > .venv-bench/.gitignore
 	.venv-bench/bin/pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	touch $@
+
+# give some two hundred bad inputs to the command line, and write docs/bad-inputs.md; fails while any is not answered
+.PHONY: bad-inputs
+bad-inputs: $(VENV)/.installed
+	$(BIN)/python -m benchmarks.bad_inputs

@@ -1,0 +1,219 @@
+"""Give bad inputs to the command line, each in a process of its own, and record what a user would see."""
+
+from __future__ import annotations
+
+import html
+import math
+import multiprocessing
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.bad_inputs.experiments import EXPERIMENTS
+from benchmarks.bad_inputs.record import BadInput, Folder
+from pdvc.measurement import Measurement, MeasurementError, read_measurement
+from simulator.scanner import simulate
+from validation.report import summary_rows
+
+_PROGRESS = re.compile(r": \d+ of \d+ in [\d.]+ s$|^(measurement|report): ")
+_RAW = re.compile(r"^Traceback |:\d+: \w*Warning: ")
+_EXPLAINED = re.compile(r"expected|missing|unknown key|not valid TOML|truncated")
+"""What every error of this software says: what was expected, or what is missing."""
+LARGE_STRAIN = 0.2
+"""A strain above this is no measurement of a metal: the table marks it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What the command line made of an input."""
+
+    case: BadInput
+    code: int | None
+    """Exit code of `measure`; None where it did not end within the limit."""
+    console: tuple[str, ...]
+    """What `measure` printed beside its progress, line by line, folders left out."""
+    verdict: str = ""
+    """The verdict in the result; empty where there is none."""
+    doubts: tuple[tuple[str, str], ...] = ()
+    """Name and figure of each reason of the verdict."""
+    strain: float = math.nan
+    """Largest strain that the report would print, without unit; nan where there is none."""
+    report: str | None = None
+    """Text of the report, or None where `report` failed or there was nothing to report."""
+    left: tuple[str, ...] = ()
+    """Files beside the experiment and the result."""
+    seconds: float = 0.0
+    """Time of `measure`, s."""
+
+    @property
+    def errors(self) -> tuple[str, ...]:
+        """Return the lines of the console that say what is wrong."""
+        return tuple(line for line in self.console if line.startswith("error: "))
+
+    @property
+    def raw(self) -> tuple[str, ...]:
+        """Return the lines of the console that are not meant for a user: tracebacks and Python's warnings."""
+        return tuple(line for line in self.console if _RAW.search(line))
+
+    @property
+    def answer(self) -> str:
+        """Return ``error``, ``warning``, ``trusted`` or ``nothing``."""
+        if self.code != 0:
+            return "error" if self.errors else "nothing"
+        return {"": "nothing", "trusted": "trusted"}.get(self.verdict, "warning")
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Return what is wrong with the answer; capitals where a user would not learn of the mistake."""
+        return tuple(_faults(self))
+
+
+def _faults(seen: Outcome) -> Iterator[str]:
+    due, answer = seen.case.due, seen.answer
+    if seen.code is None:
+        yield "NO END"
+        return
+    if seen.code not in (0, 2) or (seen.code == 2 and not seen.errors):
+        yield f"CRASH, exit code {seen.code}"
+    elif due == "good" and answer == "error":
+        yield "REFUSED"
+    elif due == "good" and answer == "warning":
+        yield "FALSE ALARM"
+    elif due == "good" and answer == "nothing":
+        yield "no verdict"
+    elif due == "warning" and answer in ("trusted", "nothing"):
+        yield "SILENT"
+    elif due == "error" and answer != "error":
+        yield "SILENT" if answer in ("trusted", "nothing") else "MEASURED, AN ERROR IS DUE"
+    if seen.raw:
+        yield "raw warnings on the console"
+    if len(seen.errors) > 1 or any(not _EXPLAINED.search(line) for line in seen.errors):
+        yield "unclear error"
+    if seen.left:
+        yield f"leaves {', '.join(seen.left)}"
+    if seen.code == 0:
+        yield from _hidden(seen)
+
+
+def _hidden(seen: Outcome) -> Iterator[str]:
+    """Give the places where the verdict of a result is not shown."""
+    if seen.report is None:
+        yield "no report"
+    if seen.answer == "warning":
+        names = [name for name, _ in seen.doubts]
+        if not names:
+            yield "no reasons"
+        if not any(seen.verdict in line for line in seen.console):
+            yield "verdict not on the console"
+        if seen.report is not None and not all(word in seen.report for word in (seen.verdict, *names)):
+            yield "verdict not in the report"
+
+
+class Bench:
+    """A scratch folder in which experiments are simulated once, and cases carried out."""
+
+    def __init__(self, scratch: Path, *, limit_s: float = 600.0) -> None:
+        self._scratch = scratch
+        self._limit_s = limit_s
+        # the server imports once what every command needs; it computes nothing, so that forking it is safe
+        self._processes = multiprocessing.get_context("forkserver")
+        self._processes.set_forkserver_preload(
+            ["pdvc.measure", "validation.cli", "validation.report", "simulator.scanner"]
+        )
+
+    def simulated(self, name: str) -> Path:
+        """Return the folder of an experiment of EXPERIMENTS, simulated at the first call."""
+        folder = self._scratch / "good" / name.replace(", ", "-").replace(" ", "-")
+        simulate(EXPERIMENTS[name], folder)
+        return folder
+
+    def carry_out(self, cases: Sequence[BadInput], jobs: int) -> Iterator[Outcome]:
+        """Carry out cases, so many side by side, and give their outcomes as they come."""
+        for name in dict.fromkeys(case.experiment for case in cases):
+            self.simulated(name)
+        with ThreadPoolExecutor(jobs) as pool:
+            for done in as_completed([pool.submit(self.outcome, case) for case in cases]):
+                yield done.result()
+
+    def outcome(self, case: BadInput) -> Outcome:
+        """Change a copy of the experiment, measure it, report it; nothing stays on disk."""
+        place = self._scratch / case.name
+        shutil.rmtree(place, ignore_errors=True)
+        folder, result = place / "experiment", place / "motion.nc"
+        # a laboratory knows no truth
+        shutil.copytree(self.simulated(case.experiment), folder, ignore=shutil.ignore_patterns("truth"))
+        case.change(Folder(path=folder, simulated=self.simulated))
+        arguments = ["measure", str(folder), "-o", str(result), *case.arguments]
+        if case.options:
+            (place / "options.toml").write_text(case.options, encoding="utf-8")
+            arguments += ["--options", str(place / "options.toml")]
+        started = time.perf_counter()
+        code = self._command(arguments, place / "console.log")
+        seconds = time.perf_counter() - started
+        known = {"experiment", "options.toml", "console.log", "motion.nc"}
+        text = (place / "console.log").read_text(encoding="utf-8", errors="replace").replace(f"{place}{os.sep}", "")
+        seen = partial(
+            Outcome,
+            case=case,
+            code=code,
+            console=tuple(line for line in text.splitlines() if line and not _PROGRESS.search(line)),
+            left=()
+            if code is None
+            else tuple(sorted(path.name for path in place.iterdir() if path.name not in known)),
+            seconds=seconds,
+        )
+        found = seen() if code != 0 or not result.is_file() else seen(**self._result(place))
+        shutil.rmtree(place)
+        return found
+
+    def _result(self, place: Path) -> dict[str, Any]:
+        """Return what a result and its report say."""
+        measurement = read_measurement(place / "motion.nc")
+        verdict = getattr(measurement, "verdict", None)
+        arguments = ["report", str(place / "motion.nc"), "-o", str(place / "report")]
+        code = self._command([*arguments, "--experiment", str(place / "experiment")], place / "report.log")
+        return {
+            "verdict": "" if verdict is None else str(verdict.word),
+            "doubts": () if verdict is None else tuple((doubt.name, doubt.figure) for doubt in verdict.doubts),
+            "strain": largest_strain(measurement),
+            "report": html.unescape((place / "report" / "report.html").read_text(encoding="utf-8"))
+            if code == 0
+            else None,
+        }
+
+    def _command(self, arguments: list[str], log: Path) -> int | None:
+        """Run the command line in a process of its own; returns its exit code, or None beyond the limit."""
+        process = self._processes.Process(target=_run, args=(arguments, str(log)), daemon=True)
+        process.start()
+        process.join(self._limit_s)
+        if process.is_alive():
+            process.kill()
+            process.join()
+            return None
+        return process.exitcode
+
+
+def largest_strain(measurement: Measurement) -> float:
+    """Return the largest strain that the report prints, without unit; nan where it prints none."""
+    try:
+        shown = next(row.here for row in summary_rows(measurement, None) if row.name.startswith("largest strain"))
+        return float(shown) / 100
+    except (MeasurementError, ValueError):
+        return math.nan
+
+
+def _run(arguments: list[str], log: str) -> None:
+    """Run the command line as in a shell, with its console in a file."""
+    with open(log, "wb") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    from validation.cli import app
+
+    app(arguments)
