@@ -8,8 +8,9 @@ import multiprocessing
 import os
 import re
 import shutil
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
@@ -116,11 +117,20 @@ def _hidden(seen: Outcome) -> Iterator[str]:
             yield "verdict not in the report"
 
 
+def carry_out(name: str, folder: Path) -> None:
+    """Simulate an experiment of EXPERIMENTS in a folder, unless it is there."""
+    simulate(EXPERIMENTS[name], folder)
+
+
 class Bench:
     """A scratch folder in which experiments are simulated once, and cases carried out."""
 
-    def __init__(self, scratch: Path, *, limit_s: float = 600.0) -> None:
+    def __init__(
+        self, scratch: Path, *, limit_s: float = 600.0, make: Callable[[str, Path], None] = carry_out
+    ) -> None:
         self._scratch = scratch
+        self._make = make
+        self._making = threading.Lock()
         self._limit_s = limit_s
         # the server imports once what every command needs; it computes nothing, so that forking it is safe
         self._processes = multiprocessing.get_context("forkserver")
@@ -129,27 +139,29 @@ class Bench:
         )
 
     def simulated(self, name: str) -> Path:
-        """Return the folder of an experiment of EXPERIMENTS, simulated at the first call."""
+        """Return the folder of an experiment of EXPERIMENTS, made at the first call."""
         folder = self._scratch / "good" / name.replace(", ", "-").replace(" ", "-")
-        simulate(EXPERIMENTS[name], folder)
+        with self._making:
+            self._make(name, folder)
         return folder
 
     def carry_out(self, cases: Sequence[BadInput], jobs: int) -> Iterator[Outcome]:
         """Carry out cases, so many side by side, and give their outcomes as they come."""
-        for name in dict.fromkeys(case.experiment for case in cases):
-            self.simulated(name)
         with ThreadPoolExecutor(jobs) as pool:
             for done in as_completed([pool.submit(self.outcome, case) for case in cases]):
                 yield done.result()
+
+    def changed(self, case: BadInput, folder: Path) -> None:
+        """Write a copy of the case's experiment, without its truth, and change it."""
+        shutil.copytree(self.simulated(case.experiment), folder, ignore=shutil.ignore_patterns("truth"))
+        case.change(Folder(path=folder, simulated=self.simulated))
 
     def outcome(self, case: BadInput) -> Outcome:
         """Change a copy of the experiment, measure it, report it; nothing stays on disk."""
         place = self._scratch / case.name
         shutil.rmtree(place, ignore_errors=True)
         folder, result = place / "experiment", place / "motion.nc"
-        # a laboratory knows no truth
-        shutil.copytree(self.simulated(case.experiment), folder, ignore=shutil.ignore_patterns("truth"))
-        case.change(Folder(path=folder, simulated=self.simulated))
+        self.changed(case, folder)
         arguments = ["measure", str(folder), "-o", str(result), *case.arguments]
         if case.options:
             (place / "options.toml").write_text(case.options, encoding="utf-8")
@@ -190,6 +202,7 @@ class Bench:
 
     def _command(self, arguments: list[str], log: Path) -> int | None:
         """Run the command line in a process of its own; returns its exit code, or None beyond the limit."""
+        log.touch()  # a process that is stopped early has not opened it
         process = self._processes.Process(target=_run, args=(arguments, str(log)), daemon=True)
         process.start()
         process.join(self._limit_s)

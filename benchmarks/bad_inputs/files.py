@@ -22,15 +22,14 @@ from benchmarks.bad_inputs.record import (
 from pdvc.experiment import DARKS, DESCRIPTION, FLATS, REFERENCE, TEST
 
 
-def plainly_written(*names: str) -> Change:
-    """Return the change that writes stacks by `tifffile.imwrite` without a word on what they are.
+def in_planes(name: str) -> Change:
+    """Return the change that stores three or four images as one page with as many planes of colour.
 
-    Three or four images then become one page with as many planes of colour.
+    That is what `tifffile.imwrite(path, counts)` did, up to now, unless it was told what the images are.
     """
 
     def change(folder: Folder) -> None:
-        for name in names:
-            tifffile.imwrite(folder.path / name, folder.counts(name))
+        tifffile.imwrite(folder.path / name, folder.counts(name), photometric="rgb", planarconfig="separate")
 
     return change
 
@@ -176,15 +175,15 @@ CONTROLS = (
         name="good-three-planes",
         due="good",
         experiment="small, three flats",
-        change=plainly_written(FLATS),
+        change=in_planes(FLATS),
         wrong="Nothing: three flats, by `tifffile.imwrite(path, flats)`: one page of three planes.",
     ),
     BadInput(
         name="good-four-planes",
         due="good",
         experiment="small, four flats",
-        change=plainly_written(*ALL),
-        wrong="Nothing: all stacks by `tifffile.imwrite(path, counts)`, with four flats: one page of four planes.",
+        change=in_planes(FLATS),
+        wrong="Nothing: four flats, by `tifffile.imwrite(path, flats)`: one page of four planes.",
     ),
     BadInput(name="good-compressed", due="good", change=compressed, wrong="Nothing: all stacks are compressed."),
     BadInput(name="good-imagej", due="good", change=of_imagej, wrong="Nothing: all stacks were saved by ImageJ."),
