@@ -30,6 +30,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", metavar="NAME", choices=names, help="these inputs, and no page")
     parser.add_argument("--limit", type=float, default=600.0, metavar="S", help="longest time of a command, s")
     parser.add_argument("--out", type=Path, default=PAGE, metavar="FILE", help="the page to write")
+    parser.add_argument("--work", type=Path, metavar="DIR", help="keep the simulated experiments here, for next time")
     given = parser.parse_args()
     cases = [case for case in CATALOGUE if given.only is None or case.name in given.only]
     # a thread for each process: inputs are carried out side by side
@@ -37,7 +38,7 @@ def main() -> None:
         os.environ[name] = "1"
     started, outcomes = time.perf_counter(), []
     with tempfile.TemporaryDirectory() as scratch:
-        for outcome in Bench(Path(scratch), limit_s=given.limit).carry_out(cases, given.jobs):
+        for outcome in Bench(given.work or Path(scratch), limit_s=given.limit).carry_out(cases, given.jobs):
             outcomes.append(outcome)
             name, _, answer, strain, seconds = row(outcome)
             print(f"{len(outcomes)}/{len(cases)}  {name}: {answer}; strain {strain or '-'} %; {seconds} s", flush=True)

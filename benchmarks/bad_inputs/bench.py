@@ -17,11 +17,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.bad_inputs.experiments import EXPERIMENTS
 from benchmarks.bad_inputs.record import BadInput, Folder
 from pdvc.measurement import Measurement, MeasurementError, read_measurement
 from simulator.scanner import simulate
-from validation.report import summary_rows
+from validation.axis import axis_history
 
 _PROGRESS = re.compile(r": \d+ of \d+ in [\d.]+ s$|^(measurement|report): ")
 _RAW = re.compile(r"^Traceback |:\d+: \w*Warning: ")
@@ -45,7 +47,7 @@ class Outcome:
     doubts: tuple[tuple[str, str], ...] = ()
     """Name and figure of each reason of the verdict."""
     strain: float = math.nan
-    """Largest strain that the report would print, without unit; nan where there is none."""
+    """Largest strain of either sign, without unit; nan where there is none."""
     report: str | None = None
     """Text of the report, or None where `report` failed or there was nothing to report."""
     left: tuple[str, ...] = ()
@@ -214,12 +216,13 @@ class Bench:
 
 
 def largest_strain(measurement: Measurement) -> float:
-    """Return the largest strain that the report prints, without unit; nan where it prints none."""
+    """Return the largest |du_z / dz| between observed sections at any step, without unit; nan where there are none."""
     try:
-        shown = next(row.here for row in summary_rows(measurement, None) if row.name.startswith("largest strain"))
-        return float(shown) / 100
-    except (MeasurementError, ValueError):
+        history = axis_history(measurement)
+    except MeasurementError:
         return math.nan
+    strain = np.abs(history.strain(history.measured))
+    return float(np.nanmax(strain)) if np.isfinite(strain).any() else math.nan
 
 
 def _run(arguments: list[str], log: str) -> None:

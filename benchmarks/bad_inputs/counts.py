@@ -47,6 +47,7 @@ def from_images(make: Callable[[Floats, Floats, Floats], Floats], *names: str) -
 
     def change(folder: Folder) -> None:
         flat, dark = (folder.counts(name).mean(axis=0) for name in (FLATS, DARKS))
+        flat = np.maximum(flat, dark + 1)  # in dead pixels, too, something can be divided by
         for name in names:
             folder.write(name, rounded(make(folder.counts(name).astype(float), flat, dark)))
 

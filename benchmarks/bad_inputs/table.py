@@ -19,7 +19,7 @@ had. Then the command line measured it and wrote the report.
 
 Either an error is due, in one line, or a result whose verdict is `doubtful` or `failed`, with the reasons by name, on
 the console, in the file and in the report. Good inputs are due the verdict `trusted`. In capitals: what a user would
-not learn of. *Strain* is the largest that the report prints; the true one is 7 to 9 %.
+not learn of. *Strain* is the largest |du_z/dz| between sections; 7 to 9 % are true.
 
 Written by `make bad-inputs`, which fails while any row has a fault.
 """
