@@ -49,7 +49,7 @@ class Outcome:
     strain: float = math.nan
     """Largest strain of either sign, without unit; nan where there is none."""
     report: str | None = None
-    """Text of the report, or None where `report` failed or there was nothing to report."""
+    """Text of the report; None where `report` failed, or was not asked for: a result without a verdict shows none."""
     left: tuple[str, ...] = ()
     """Files beside the experiment and the result."""
     seconds: float = 0.0
@@ -107,7 +107,7 @@ def _faults(seen: Outcome) -> Iterator[str]:
 
 def _hidden(seen: Outcome) -> Iterator[str]:
     """Give the places where the verdict of a result is not shown."""
-    if seen.report is None:
+    if seen.verdict and seen.report is None:
         yield "no report"
     if seen.answer == "warning":
         names = [name for name, _ in seen.doubts]
@@ -191,15 +191,17 @@ class Bench:
         """Return what a result and its report say."""
         measurement = read_measurement(place / "motion.nc")
         verdict = getattr(measurement, "verdict", None)
+        strain = largest_strain(measurement)
+        if verdict is None:
+            return {"strain": strain}
         arguments = ["report", str(place / "motion.nc"), "-o", str(place / "report")]
         code = self._command([*arguments, "--experiment", str(place / "experiment")], place / "report.log")
+        page = place / "report" / "report.html"
         return {
-            "verdict": "" if verdict is None else str(verdict.word),
-            "doubts": () if verdict is None else tuple((doubt.name, doubt.figure) for doubt in verdict.doubts),
-            "strain": largest_strain(measurement),
-            "report": html.unescape((place / "report" / "report.html").read_text(encoding="utf-8"))
-            if code == 0
-            else None,
+            "verdict": str(verdict.word),
+            "doubts": tuple((str(doubt.name), str(doubt.figure)) for doubt in verdict.doubts),
+            "strain": strain,
+            "report": html.unescape(page.read_text(encoding="utf-8")) if code == 0 else None,
         }
 
     def _command(self, arguments: list[str], log: Path) -> int | None:
