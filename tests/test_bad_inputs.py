@@ -97,6 +97,7 @@ def test_each_experiment_is_a_scenario_of_its_own(name):
     assert sum(other == scenario for other in EXPERIMENTS.values()) == 1
 
 
+@pytest.mark.skipif(not PAGE.is_file(), reason="the page is not written yet: make bad-inputs")
 def test_the_page_lists_the_catalogue():
     rows = [line.split("|")[1].strip().rstrip("*") for line in PAGE.read_text().splitlines() if line.startswith("| ")]
     assert rows[2:] == list(NAMED)
