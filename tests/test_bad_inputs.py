@@ -110,7 +110,7 @@ EXPECTED = "error: experiment.toml: pixel_mm: expected a number"
 
 def measured(case, verdict):
     """Return a result that is shown as it should be."""
-    doubts = () if verdict in ("", "trusted") else (("air-level", "0.4"),)
+    doubts = () if verdict in ("", "trusted") else (("air-level", "0.4", "expose again"),)
     return Outcome(
         case=case,
         code=0,
@@ -156,6 +156,7 @@ def test_what_is_not_meant_for_a_user_is_always_a_fault(case, code, verdict):
         ({"report": "doubtful"}, "verdict not in the report"),
         ({"report": None}, "no report"),
         ({"doubts": ()}, "no reasons"),
+        ({"doubts": (("air-level", "0.4", ""),)}, "a reason without figure or advice"),
         ({"left": ("motion.nc.work",)}, "leaves motion.nc.work"),
         (
             {"code": 2, "console": ("error: 756-th leading minor of the array is not positive definite",)},

@@ -44,8 +44,8 @@ class Outcome:
     """What `measure` printed beside its progress, line by line, folders left out."""
     verdict: str = ""
     """The verdict in the result; empty where there is none."""
-    doubts: tuple[tuple[str, str], ...] = ()
-    """Name and figure of each reason of the verdict."""
+    doubts: tuple[tuple[str, str, str], ...] = ()
+    """Name, figure and advice of each reason of the verdict."""
     strain: float = math.nan
     """Largest strain of either sign, without unit; nan where there is none."""
     report: str | None = None
@@ -110,9 +110,11 @@ def _hidden(seen: Outcome) -> Iterator[str]:
     if seen.verdict and seen.report is None:
         yield "no report"
     if seen.answer == "warning":
-        names = [name for name, _ in seen.doubts]
+        names = [name for name, _, _ in seen.doubts]
         if not names:
             yield "no reasons"
+        if not all(map(all, seen.doubts)):
+            yield "a reason without figure or advice"
         if not any(seen.verdict in line for line in seen.console):
             yield "verdict not on the console"
         if seen.report is not None and not all(word in seen.report for word in (seen.verdict, *names)):
@@ -199,7 +201,7 @@ class Bench:
         page = place / "report" / "report.html"
         return {
             "verdict": str(verdict.word),
-            "doubts": tuple((str(doubt.name), str(doubt.figure)) for doubt in verdict.doubts),
+            "doubts": tuple((str(doubt.name), str(doubt.figure), str(doubt.advice)) for doubt in verdict.doubts),
             "strain": strain,
             "report": html.unescape(page.read_text(encoding="utf-8")) if code == 0 else None,
         }

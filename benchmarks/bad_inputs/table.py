@@ -74,5 +74,5 @@ def said(outcome: Outcome) -> str:
     if outcome.code != 0:
         line = " / ".join(outcome.errors) or (outcome.console[-1] if outcome.console else "")
         return line if len(line) <= LONGEST else line[: LONGEST - 4] + " ..."
-    reasons = ", ".join(f"{name} ({figure})" for name, figure in outcome.doubts)
+    reasons = ", ".join(f"{name} ({figure})" for name, figure, _ in outcome.doubts)
     return f"{outcome.verdict}: {reasons}" if reasons else outcome.verdict or "a result without a verdict"
