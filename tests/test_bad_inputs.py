@@ -163,6 +163,7 @@ def test_what_is_not_meant_for_a_user_is_always_a_fault(case, code, verdict):
             "unclear error",
         ),
         ({"code": 2, "console": (EXPECTED, EXPECTED)}, "unclear error"),
+        ({"code": 2, "console": (EXPECTED + ", given {'rows': 3}",)}, "unclear error"),
         ({"code": 2}, "CRASH, exit code 2"),
         ({"code": 1, "console": (EXPECTED,)}, "CRASH, exit code 1"),
         ({"code": None}, "NO END"),

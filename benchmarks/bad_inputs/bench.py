@@ -28,7 +28,7 @@ from validation.axis import axis_history
 _PROGRESS = re.compile(r": \d+ of \d+ in [\d.]+ s$|^(measurement|report): ")
 _RAW = re.compile(r"^Traceback |:\d+: \w*Warning: ")
 _EXPLAINED = re.compile(r"expected|missing|unknown key|not valid TOML|truncated")
-"""What every error of this software says: what was expected, or what is missing."""
+"""What every error of this software says: what was expected, or what is missing; and no dictionary of Python's."""
 LARGE_STRAIN = 0.2
 """A strain above this is no measurement of a metal: the table marks it."""
 
@@ -97,7 +97,7 @@ def _faults(seen: Outcome) -> Iterator[str]:
         yield "SILENT" if answer in ("trusted", "nothing") else "MEASURED, AN ERROR IS DUE"
     if seen.raw:
         yield "raw warnings on the console"
-    if len(seen.errors) > 1 or any(not _EXPLAINED.search(line) for line in seen.errors):
+    if len(seen.errors) > 1 or any(not _EXPLAINED.search(line) or "{'" in line for line in seen.errors):
         yield "unclear error"
     if seen.left:
         yield f"leaves {', '.join(seen.left)}"
