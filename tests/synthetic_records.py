@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -118,4 +118,13 @@ def measurement(amplitude: Floats, *, unobserved: tuple[int, ...] = (), title: s
         seconds={"reconstruct": 12.5, "measure": 60.25},
         options="scale = 2\n",
         versions="pdvc-bench 0.1.0, numpy 2",
+    )
+
+
+def drawn(measurement: Measurement, rng: np.random.Generator) -> Measurement:
+    """Return the measurement with an error of the covariance that it claims."""
+    error = np.linalg.cholesky(measurement.covariance) @ rng.normal(size=len(measurement.covariance))
+    error = error.reshape(-1, *measurement.amplitude.shape[1:])
+    return replace(
+        measurement, amplitude=measurement.amplitude + np.einsum("ft,fjk->tjk", measurement.time_functions, error)
     )

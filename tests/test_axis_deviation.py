@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tests import synthetic_records as records
-from tests.test_calibration import drawn
 from validation.axis_deviation import axis_deviation
 
 
@@ -47,7 +46,7 @@ def test_errors_drawn_from_the_covariance_scatter_as_predicted(case):
     measurement, truth = case
     rng = np.random.default_rng(12)
     predicted = axis_deviation(measurement, truth)
-    draws = [axis_deviation(drawn(measurement, rng), truth) for _ in range(60)]
+    draws = [axis_deviation(records.drawn(measurement, rng), truth) for _ in range(60)]
     for errors, std in (
         (np.stack([draw.error for draw in draws]), predicted.std),
         (np.stack([draw.strain_error for draw in draws]), predicted.strain_std),

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from pdvc import gauss_newton
 from pdvc.gauss_newton import blocks_of
 from pdvc.prior import Prior
+from tests.linear_problems import linear_model, random_equations
 from tests.small_case import SECTIONS, STEPS, lineariser, radiographs
-from tests.test_solvers import linear_model, random_equations
 
 SHAPE = (2, 3)
 
@@ -43,7 +43,7 @@ def test_blocks_give_the_dense_solution(labels, seed):
     assert sorted(np.concatenate([block.steps for block in blocks])) == list(range(9))
     deviation = 0.7
     found = gauss_newton.solve(
-        linear_model(equations, functions, SHAPE),
+        linear_model(equations),
         functions,
         np.zeros((len(functions), *SHAPE)),
         Prior(deviation_voxel=np.full(SHAPE, deviation)),
@@ -68,7 +68,7 @@ def test_what_is_found_at_a_step_does_not_depend_on_the_others():
     believed = Prior(deviation_voxel=np.full(SHAPE, 0.05))
     found = [
         gauss_newton.solve(
-            linear_model(each, 3 * np.eye(9), SHAPE),
+            linear_model(each),
             3 * np.eye(9),
             np.zeros((9, *SHAPE)),
             believed,
@@ -91,7 +91,7 @@ def test_linked_functions_are_one_block():
 def test_a_step_that_goes_too_far_holds_no_other_back():
     """The residual of step 4 rises unless it goes a quarter of the way; the other steps go the whole way."""
     equations, functions = random_equations(2, shape=SHAPE), np.sqrt(9) * np.eye(9)
-    exact = linear_model(equations, functions, SHAPE)
+    exact = linear_model(equations)
     whole = np.stack([np.linalg.solve(b, c) for b, c in zip(equations.matrix, equations.vector, strict=True)])
 
     def model(amplitude):
@@ -115,7 +115,7 @@ def test_a_step_that_goes_too_far_holds_no_other_back():
 @pytest.mark.parametrize("stuck", [[3], list(range(9))])
 def test_steps_that_nothing_improves_are_left_and_said(stuck):
     equations, functions = random_equations(2, shape=SHAPE), np.sqrt(9) * np.eye(9)
-    exact = linear_model(equations, functions, SHAPE)
+    exact = linear_model(equations)
     passes = 0
 
     def model(amplitude):

@@ -13,7 +13,7 @@ from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions
 from simulator.scanner import simulate
 from tests import synthetic_records as records
-from tests.test_trial import trial
+from tests.tiny_scenarios import trial
 from validation.bound import bound_of
 from validation.calibration import calibration, true_coefficients
 from validation.scores import point_errors
@@ -56,15 +56,6 @@ def truth_of(measurement: Measurement) -> Moved:
     return Moved(points, moved)
 
 
-def drawn(measurement: Measurement, rng: np.random.Generator) -> Measurement:
-    """Return the measurement with an error of the covariance that it claims."""
-    error = np.linalg.cholesky(measurement.covariance) @ rng.normal(size=len(measurement.covariance))
-    error = error.reshape(-1, *measurement.amplitude.shape[1:])
-    return replace(
-        measurement, amplitude=measurement.amplitude + np.einsum("ft,fjk->tjk", measurement.time_functions, error)
-    )
-
-
 def test_coefficients_of_a_motion_inside_the_span_are_found_exactly():
     exact = known_motion(np.random.default_rng(1))
     found, missed = true_coefficients(exact.basis, exact.time_functions, exact.voxel_mm, truth_of(exact))
@@ -92,7 +83,7 @@ def test_errors_drawn_from_the_covariance_are_covered_as_they_should_be():
     truth = truth_of(exact)
     found = []
     for _ in range(60):
-        one = drawn(exact, rng)
+        one = records.drawn(exact, rng)
         found.append(calibration(one, truth, point_errors(one, truth).components))
     for level, part in ((0.5, "coverage_50"), (0.9, "coverage_90"), (0.95, "coverage_95")):
         for name in ("across_beam", "vertical", "along_beam", "strain"):
@@ -109,7 +100,7 @@ def test_an_interval_half_as_wide_as_due_shows():
     rng = np.random.default_rng(8)
     exact = known_motion(rng)
     truth = truth_of(exact)
-    bold = [replace(drawn(exact, rng), covariance=exact.covariance / 4) for _ in range(20)]
+    bold = [replace(records.drawn(exact, rng), covariance=exact.covariance / 4) for _ in range(20)]
     found = [calibration(one, truth, point_errors(one, truth).components) for one in bold]
     assert np.sqrt(np.mean([one.z_rms.vertical**2 for one in found])) == pytest.approx(2, rel=0.2)
     assert np.mean([one.coverage_95.vertical for one in found]) < 0.8

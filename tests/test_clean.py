@@ -14,14 +14,14 @@ from simulator.clean import clean_file, clean_stack
 from simulator.scanner import simulate
 from simulator.scenario import course_of
 from simulator.views import Stack, clear_images, image_count, prepare
-from tests.test_scanner import tiny as plain
+from tests.tiny_scenarios import tinier
 
 ALL = (REFERENCE, TEST, FLATS, DARKS, interrupted_stack(0))
 REST, LOADED, HELD = STACKS = (Stack("reference"), Stack("test"), Stack("interrupted", 12))
 
 
 def tiny(**changes):
-    return plain(interrupted={"steps": [12], "views": 6}, **changes)
+    return tinier(interrupted={"steps": [12], "views": 6}, **changes)
 
 
 def stacks(folder):

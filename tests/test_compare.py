@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 
 from pdvc.settings import SettingsError
 from simulator.scenario import Scenario
-from tests.command_line import only_line, pdvc_bench
-from tests.test_job import TINY
-from tests.test_methods import install
+from tests.command_line import install, only_line, pdvc_bench
+from tests.tiny_scenarios import TINY
 from validation.compare import Comparison, with_scans
 from validation.compare_figures import Point, cost_figure, draw_cost, draw_steps, steps_figure, style_of
 from validation.compare_tables import TextTable, number, with_bounds, with_interval

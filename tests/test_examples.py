@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_methods import install
+from tests.command_line import install
 from validation.methods import GROUP, find_method
 from validation.scores import score
 from validation.small_cases import SmallExperiment, small_scenario

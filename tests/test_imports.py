@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -35,3 +36,19 @@ def test_the_command_line_starts_without_loading_numerics():
     code = f"import sys, validation.cli; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_no_test_module_imports_another():
+    """What several share is in a module that holds no tests: a test may then be moved or dropped by itself."""
+    paths = sorted((ROOT / "tests").glob("*.py"))
+    tests = {path.stem for path in paths if path.stem.startswith("test_")}
+    assert len(tests) > 40  # they were found
+    for path in paths:
+        named: set[str] = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                whole = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+                named.update(
+                    part for name in (*whole, *(each.name for each in node.names)) for part in name.split(".")
+                )
+        assert not named & tests, f"{path.name} imports a test module"

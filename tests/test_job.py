@@ -10,33 +10,7 @@ import numpy as np
 import pytest
 
 from tests.command_line import only_line, pdvc_bench
-
-TINY = """
-name = "tiny"
-title = "Small enough for a test"
-discarded_rows = 12
-
-[graphite]
-mean_diameter_mm = 0.25
-smallest_diameter_mm = 0.1
-largest_diameter_mm = 0.5
-gap_mm = 0.016
-
-[geometry]
-pixel_mm = 2.3968
-rows = 119
-columns = 54
-
-[acquisition]
-reference_views = 60
-test_steps = 25
-steps_per_turn = 10
-subpixels = 2
-
-[loading]
-plateau_steps = 10
-stroke_mm_per_s = 0.01
-"""
+from tests.tiny_scenarios import TINY
 
 
 @pytest.fixture(scope="module")

@@ -11,21 +11,12 @@ import pytest
 
 from pdvc.history import Steps
 from pdvc.options import MeasureOptions, paper_options
+from tests.command_line import install
 from validation import methods
 from validation.methods import MethodError, find_method, method_names
 
 ROOT = Path(__file__).parent.parent
 OURS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][methods.GROUP]
-
-
-def install(folder, entry_points, module="", name="toy"):
-    """Lay out a package as pip installs it: a module, its metadata, and its entry points (name, value)."""
-    info = folder / f"{name}-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    lines = [f"{key} = {value}\n" for key, value in entry_points.items()]
-    (info / "entry_points.txt").write_text(f"[{methods.GROUP}]\n{''.join(lines)}")
-    (folder / f"{name}.py").write_text(module)
 
 
 @pytest.fixture

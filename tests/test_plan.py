@@ -13,8 +13,7 @@ from pdvc.measure import measure
 from simulator.scanner import simulate
 from simulator.truth import read_truth
 from tests.command_line import pdvc_bench
-from tests.test_job import TINY
-from tests.test_trial import trial
+from tests.tiny_scenarios import TINY, trial
 from validation.calibration import calibration
 from validation.plan import designs_around, plan
 from validation.plan_tables import designs_csv, designs_table, weak_table

@@ -9,32 +9,17 @@ from pdvc.settings import SettingsError
 from simulator import scanner
 from simulator.detector import expected
 from simulator.scanner import SimulationError, simulate
-from simulator.scenario import Scenario, course_of
+from simulator.scenario import course_of
 from simulator.side_by_side import in_order
 from simulator.truth import DISPLACEMENT, read_scenario, read_truth
 from simulator.views import Stack, clear_images, exposed, moved_body, prepare, step_image, transmission
-
-
-def tiny(**changes):
-    """Return an experiment of 40 x 24 px that takes a fraction of a second."""
-    values = {
-        "name": "tiny",
-        "discarded_rows": 4,
-        "specimen": {"facet_mm": 0.12, "thinned": "both"},
-        "graphite": {"mean_diameter_mm": 0.2, "smallest_diameter_mm": 0.1, "largest_diameter_mm": 0.4},
-        "geometry": {"rows": 40, "columns": 24, "pixel_mm": 7.1},
-        "acquisition": {"reference_views": 20, "test_steps": 20, "steps_per_turn": 10, "subpixels": 2},
-        "loading": {"plateau_steps": 8, "stroke_mm_per_s": 0.01, "necking_strain": 0.0},
-    }
-    for key, value in changes.items():
-        values[key] = {**values[key], **value} if isinstance(values.get(key), dict) else value
-    return Scenario.parse(values, where="tiny")
+from tests.tiny_scenarios import tinier
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "experiment"
-    simulate(tiny(), path, workers=2)
+    simulate(tinier(), path, workers=2)
     return path
 
 
@@ -47,10 +32,10 @@ def test_the_folder_reads_as_an_experiment(folder):
     assert experiment.reference.counts.shape == (20, 40, 24)
     assert experiment.test.counts.shape == (20, 40, 24)
     assert (len(experiment.flats), len(experiment.darks), experiment.frames) == (2, 1, 5)
-    assert experiment.geometry == tiny().geometry.cone_beam()
+    assert experiment.geometry == tinier().geometry.cone_beam()
     assert experiment.photons_per_count == pytest.approx(0.2)
     np.testing.assert_allclose(experiment.test.angle_rad, 2 * np.pi * np.arange(20) / 10, atol=1e-11)
-    np.testing.assert_allclose(experiment.test.force_N, course_of(tiny()).history.force_N, atol=5)
+    np.testing.assert_allclose(experiment.test.force_N, course_of(tinier()).history.force_N, atol=5)
 
 
 def test_the_sample_is_in_the_middle_and_darker_than_the_beam(folder):
@@ -62,9 +47,9 @@ def test_the_sample_is_in_the_middle_and_darker_than_the_beam(folder):
 
 
 def test_truth_holds_scenario_and_displacement(folder):
-    assert read_scenario(folder) == tiny()
+    assert read_scenario(folder) == tinier()
     truth = read_truth(folder)
-    course = course_of(tiny())
+    course = course_of(tinier())
     assert truth.point_mm.shape == (81 * 5, 3)
     assert truth.displacement_mm.shape == (20, 81 * 5, 3)
     np.testing.assert_array_equal(truth.point_mm[::5, :2], 0.0)
@@ -75,14 +60,14 @@ def test_truth_holds_scenario_and_displacement(folder):
 
 
 def test_counts_do_not_depend_on_workers(folder, tmp_path):
-    simulate(tiny(), tmp_path, workers=1)
+    simulate(tinier(), tmp_path, workers=1)
     for one, two in zip(stacks(tmp_path), stacks(folder), strict=True):
         np.testing.assert_array_equal(one, two)
     assert (tmp_path / DESCRIPTION).read_bytes() == (folder / DESCRIPTION).read_bytes()
 
 
 def test_the_seed_changes_the_counts(folder, tmp_path):
-    simulate(tiny(seed=1, acquisition={"reference_views": 1, "test_steps": 1}, motion={"ingredients": []}), tmp_path)
+    simulate(tinier(seed=1, acquisition={"reference_views": 1, "test_steps": 1}, motion={"ingredients": []}), tmp_path)
     assert not np.array_equal(tifffile.imread(tmp_path / FLATS), tifffile.imread(folder / FLATS))
 
 
@@ -93,11 +78,11 @@ def test_an_interrupted_run_goes_on_to_the_same_counts(folder, tmp_path, task, a
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(tiny(), tmp_path, progress=interrupt, workers=2)
+        simulate(tinier(), tmp_path, progress=interrupt, workers=2)
     assert not (tmp_path / DESCRIPTION).exists()
     assert not (tmp_path / TEST).exists()
     starts = {}
-    simulate(tiny(), tmp_path, progress=lambda name, done, total: starts.setdefault(name, done), workers=2)
+    simulate(tinier(), tmp_path, progress=lambda name, done, total: starts.setdefault(name, done), workers=2)
     assert starts[task] == at
     for one, two in zip(stacks(tmp_path), stacks(folder), strict=True):
         np.testing.assert_array_equal(one, two)
@@ -106,19 +91,19 @@ def test_an_interrupted_run_goes_on_to_the_same_counts(folder, tmp_path, task, a
 
 def test_a_complete_folder_is_left_alone(folder):
     stamp = (folder / DESCRIPTION).stat().st_mtime_ns
-    simulate(tiny(), folder, progress=lambda *_: pytest.fail("nothing is left to do"))
+    simulate(tinier(), folder, progress=lambda *_: pytest.fail("nothing is left to do"))
     assert (folder / DESCRIPTION).stat().st_mtime_ns == stamp
 
 
 def test_another_scenario_is_refused_with_the_key_that_differs(folder):
     with pytest.raises(SimulationError, match=r"another scenario \(tiny; detector\.frames differs\)"):
-        simulate(tiny(detector={"frames": 3}), folder)
+        simulate(tinier(detector={"frames": 3}), folder)
 
 
 def test_an_experiment_that_was_not_simulated_is_refused(tmp_path):
     (tmp_path / DESCRIPTION).write_text("title = 'real data'")
     with pytest.raises(SimulationError, match=r"holds experiment\.toml of an experiment that was not simulated"):
-        simulate(tiny(), tmp_path)
+        simulate(tinier(), tmp_path)
     assert (tmp_path / DESCRIPTION).read_text() == "title = 'real data'"
 
 
@@ -131,7 +116,7 @@ def test_a_full_disk_is_told_in_one_line_and_leaves_nothing_that_looks_whole(tmp
 
     monkeypatch.setattr(scanner, "StackWriter", FullDisk)
     with pytest.raises(SimulationError, match=r"disk full: tiny needs \d+ MB") as caught:
-        simulate(tiny(), tmp_path)
+        simulate(tinier(), tmp_path)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / DESCRIPTION).exists()
     assert not (tmp_path / REFERENCE).exists()
@@ -147,7 +132,7 @@ def test_truth_that_is_missing_or_damaged_is_refused(tmp_path):
 
 
 def test_without_motion_the_test_repeats_the_reference(tmp_path):
-    still = tiny(
+    still = tinier(
         motion={"ingredients": []},
         acquisition={"steps_per_turn": 20},
         detector={"photons_per_pixel": 1e9, "readout_noise_counts": 0.0},
@@ -165,7 +150,7 @@ def test_with_motion_the_test_differs_by_more_than_noise(folder):
 
 def test_rigid_motion_by_a_step_of_the_stage_looks_like_the_next_view():
     # wobble-free turn about z by +10 degrees and stage at 0 = no motion and stage at +10 degrees
-    turned = tiny(
+    turned = tinier(
         motion={
             "ingredients": ["backlash"],
             "backlash": {
@@ -184,7 +169,7 @@ def test_rigid_motion_by_a_step_of_the_stage_looks_like_the_next_view():
 
 
 def test_a_lean_along_the_beam_axis_is_seen_and_a_zero_one_is_not():
-    plain, leaning = tiny(), tiny(misalignment={"lean_deg": 5.0})
+    plain, leaning = tinier(), tinier(misalignment={"lean_deg": 5.0})
     images = []
     for scenario in (plain, leaning):
         bench = prepare(scenario, course_of(scenario))
@@ -194,9 +179,9 @@ def test_a_lean_along_the_beam_axis_is_seen_and_a_zero_one_is_not():
 
 
 def test_exposure_while_turning_is_the_mean_of_still_exposures():
-    turning = tiny(acquisition={"exposure_samples": 2, "exposure_share": 0.5})
+    turning = tinier(acquisition={"exposure_samples": 2, "exposure_share": 0.5})
     bench = prepare(turning, course_of(turning))
-    still = prepare(tiny(), course_of(tiny()))
+    still = prepare(tinier(), course_of(tinier()))
     mean = sum(transmission(still, still.body, 0.4 + shift, 0.0) for shift in (-0.0125, 0.0125)) / 2
     np.testing.assert_allclose(transmission(bench, bench.body, 0.4, 0.1), mean, atol=1e-6)
 
@@ -223,7 +208,7 @@ def test_an_error_in_one_image_surfaces():
 
 
 def test_images_can_be_made_one_at_a_time(folder):
-    bench = prepare(tiny(), course_of(tiny()))
+    bench = prepare(tinier(), course_of(tinier()))
     np.testing.assert_array_equal(step_image(bench, 7), tifffile.imread(folder / TEST)[7])
 
 
@@ -233,13 +218,13 @@ HELD = {"steps": (0, 13), "views": 10, "view_s": 3.0}
 @pytest.fixture(scope="module")
 def held_folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("held") / "experiment"
-    simulate(tiny(interrupted=HELD), path, workers=2)
+    simulate(tinier(interrupted=HELD), path, workers=2)
     return path
 
 
 def test_interrupted_scans_are_recorded_with_step_angle_time_and_force(held_folder):
     scans = read_experiment(held_folder).interrupted
-    history = course_of(tiny()).history
+    history = course_of(tinier()).history
     assert [scan.step for scan in scans] == [0, 13]
     for scan in scans:
         assert scan.series.counts.shape == (10, 40, 24)
@@ -258,7 +243,7 @@ def test_interrupted_scans_change_no_other_count_and_no_recorded_force(folder, h
 
 
 def test_by_default_an_interrupted_scan_is_taken_like_the_reference_scan():
-    course = course_of(tiny(interrupted={"steps": (4,)}))
+    course = course_of(tinier(interrupted={"steps": (4,)}))
     np.testing.assert_array_equal(course.interrupted_angle_rad, course.reference_angle_rad)
     expected_s = course.history.time_s[4] + course.reference_time_s
     np.testing.assert_allclose(course.interrupted_time_s, expected_s[None])
@@ -271,7 +256,7 @@ def held_image(bench, step, view):
 
 def test_a_view_at_the_angle_of_the_held_step_shows_what_the_step_shows():
     """Steps turn by a tenth of a turn, and so do these views: view 3 stands where step 13 stands."""
-    quiet = tiny(interrupted=HELD, detector={"photons_per_pixel": 1e9, "readout_noise_counts": 0.0})
+    quiet = tinier(interrupted=HELD, detector={"photons_per_pixel": 1e9, "readout_noise_counts": 0.0})
     bench = prepare(quiet, course_of(quiet))
     held = moved_body(bench.body, bench.course.motion, 13)
     scan, step = held_image(bench, 13, 3), step_image(bench, 13)
@@ -283,7 +268,7 @@ def test_a_view_at_the_angle_of_the_held_step_shows_what_the_step_shows():
 
 
 def test_without_motion_an_interrupted_scan_differs_from_the_reference_scan_by_its_noise_alone(tmp_path):
-    still = tiny(motion={"ingredients": []}, interrupted={"steps": (3, 19)}, detector={"bad_pixel_fraction": 0.0})
+    still = tinier(motion={"ingredients": []}, interrupted={"steps": (3, 19)}, detector={"bad_pixel_fraction": 0.0})
     simulate(still, tmp_path)
     experiment = read_experiment(tmp_path)
     reference = experiment.reference.counts.astype(float)
@@ -304,9 +289,9 @@ def test_an_interrupted_scan_that_was_interrupted_itself_goes_on_to_the_same_cou
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        simulate(tiny(interrupted=HELD), tmp_path, progress=interrupt, workers=2)
+        simulate(tinier(interrupted=HELD), tmp_path, progress=interrupt, workers=2)
     assert not (tmp_path / DESCRIPTION).exists()
-    simulate(tiny(interrupted=HELD), tmp_path, workers=1)
+    simulate(tinier(interrupted=HELD), tmp_path, workers=1)
     for n in range(2):
         np.testing.assert_array_equal(
             tifffile.imread(tmp_path / interrupted_stack(n)), tifffile.imread(held_folder / interrupted_stack(n))
@@ -314,16 +299,16 @@ def test_an_interrupted_scan_that_was_interrupted_itself_goes_on_to_the_same_cou
 
 
 def test_a_folder_that_lost_an_interrupted_scan_is_completed(held_folder, tmp_path):
-    simulate(tiny(interrupted=HELD), tmp_path)
+    simulate(tinier(interrupted=HELD), tmp_path)
     (tmp_path / interrupted_stack(1)).unlink()
-    simulate(tiny(interrupted=HELD), tmp_path)
+    simulate(tinier(interrupted=HELD), tmp_path)
     np.testing.assert_array_equal(
         tifffile.imread(tmp_path / interrupted_stack(1)), tifffile.imread(held_folder / interrupted_stack(1))
     )
 
 
 def test_the_noise_of_a_scan_depends_on_its_step_not_on_the_other_scans(held_folder):
-    alone = tiny(interrupted={**HELD, "steps": (13,)})
+    alone = tinier(interrupted={**HELD, "steps": (13,)})
     bench = prepare(alone, course_of(alone))
     image = held_image(bench, 13, 2)
     np.testing.assert_array_equal(image, tifffile.imread(held_folder / interrupted_stack(1))[2])

@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdvc import gauss_newton, pgd
-from pdvc.equations import Equations, linearise, residuals
+from pdvc.equations import linearise, residuals
 from pdvc.prior import Prior
 from pdvc.sections import SectionBasis
 from pdvc.systematic import Systematic
 from pdvc.uncertainty import posterior
+from tests.linear_problems import chi2_of, linear_model, random_equations, random_functions
 from tests.small_case import (
     SECTIONS,
     SHAPE,
@@ -37,46 +38,6 @@ ONE_PASS = {"passes_per_mode": 1}
 
 def prior(deviation=1e3, shape=SECTIONS.shape):
     return Prior(deviation_voxel=np.full(shape, deviation))
-
-
-def random_equations(seed, *, steps=9, shape=(2, 3), pixels=50):
-    """Return equations with full B(t), from random sensitivities and residuals, and no image behind them."""
-    rng = np.random.default_rng(seed)
-    size = shape[0] * shape[1]
-    s, rho = rng.normal(size=(steps, pixels, size)), rng.normal(size=(steps, pixels))
-    return Equations(
-        matrix=np.einsum("tri,trj->tij", s, s),
-        vector=np.einsum("tri,tr->ti", s, rho),
-        chi2=(rho**2).sum(axis=1),
-        residual=rho[:, :, None].astype(np.float32),
-        pixels=steps * pixels,
-    )
-
-
-def random_functions(seed, *, functions=3, steps=9):
-    q = np.linalg.qr(np.random.default_rng(seed + 1000).normal(size=(steps, functions)))[0]
-    return q.T * np.sqrt(steps)
-
-
-def linear_model(start, functions, shape):
-    """Return a linear problem's equations at any amplitudes, from those at zero: S does not change."""
-
-    def at(amplitude):
-        a = amplitude.reshape(len(amplitude), -1)
-        bent = np.einsum("tij,tj->ti", start.matrix, a)
-        chi2 = start.chi2 - 2 * (a * start.vector).sum(axis=1) + (a * bent).sum(axis=1)
-        return replace(start, vector=start.vector - bent, chi2=chi2)
-
-    return at
-
-
-def chi2_of(equations, functions, coefficients):
-    """Return chi2 of the linear model at coefficients (function, unknown), straight from its definition."""
-    a = coefficients.T @ functions
-    return sum(
-        equations.chi2[t] - 2 * a[:, t] @ equations.vector[t] + a[:, t] @ equations.matrix[t] @ a[:, t]
-        for t in range(functions.shape[1])
-    )
 
 
 # Equations and Hessian by brute force
@@ -130,7 +91,7 @@ def test_a_mode_s_value_is_no_worse_than_that_of_any_random_start():
 def test_gauss_newton_solves_a_linear_problem_in_one_pass():
     equations, functions = random_equations(3), random_functions(3)
     found = gauss_newton.solve(
-        linear_model(equations, functions, (2, 3)),
+        linear_model(equations),
         functions,
         np.zeros((3, 2, 3)),
         prior(1e6, (2, 3)),
@@ -144,7 +105,7 @@ def test_gauss_newton_solves_a_linear_problem_in_one_pass():
 
 def test_pgd_comes_to_gauss_newton_s_solution_with_enough_modes():
     equations, functions = random_equations(4), random_functions(4)
-    model, start, believed = linear_model(equations, functions, (2, 3)), np.zeros((3, 2, 3)), prior(1e6, (2, 3))
+    model, start, believed = linear_model(equations), np.zeros((3, 2, 3)), prior(1e6, (2, 3))
     direct = gauss_newton.solve(model, functions, start, believed, most_passes=5, least_change_voxel=1e-9)
     greedy = pgd.solve(model, functions, start, believed, most_modes=300, least_gain=0.0, noise_rms=None, **ONE_PASS)
     np.testing.assert_allclose(greedy.coefficients, direct.coefficients, atol=1e-4)
@@ -156,7 +117,7 @@ def test_pgd_comes_to_gauss_newton_s_solution_with_enough_modes():
 @pytest.mark.parametrize("solver", ["pgd", "gauss-newton"])
 def test_a_strong_prior_leaves_no_motion(solver):
     equations, functions = random_equations(5), random_functions(5)
-    model, start, believed = linear_model(equations, functions, (2, 3)), np.zeros((3, 2, 3)), prior(1e-5, (2, 3))
+    model, start, believed = linear_model(equations), np.zeros((3, 2, 3)), prior(1e-5, (2, 3))
     if solver == "pgd":
         found = pgd.solve(model, functions, start, believed, most_modes=3, least_gain=0.0, noise_rms=None, **ONE_PASS)
     else:
@@ -172,7 +133,7 @@ def test_a_strong_prior_pulls_back_to_no_motion_from_a_start():
     vector = np.einsum("tij,tj->ti", equations.matrix, begun)
     equations = replace(equations, vector=vector, chi2=equations.chi2 + (vector * begun).sum(axis=1))
     found = gauss_newton.solve(
-        linear_model(equations, functions, (2, 3)),
+        linear_model(equations),
         functions,
         start,
         prior(1e-4, (2, 3)),
@@ -387,7 +348,7 @@ def test_the_systematic_residual_is_taken_off_the_radiographs():
 def greedy(**options):
     equations, functions = random_equations(9), random_functions(9)
     options = {**ONE_PASS, "most_modes": 3, "least_gain": 0.0, "noise_rms": None, **options}
-    model = linear_model(equations, functions, (2, 3))
+    model = linear_model(equations)
     return pgd.solve(model, functions, np.zeros((3, 2, 3)), prior(1e3, (2, 3)), **options)
 
 
@@ -414,7 +375,7 @@ def test_pgd_stops_where_no_mode_helps():
     equations = replace(random_equations(9), vector=np.zeros((9, 6)))
     functions = random_functions(9)
     found = pgd.solve(
-        linear_model(equations, functions, (2, 3)),
+        linear_model(equations),
         functions,
         np.zeros((3, 2, 3)),
         prior(1e3, (2, 3)),
@@ -442,7 +403,7 @@ def test_gauss_newton_stops_at_the_most_passes():
 
 def test_gauss_newton_stops_where_no_step_helps():
     found = gauss_newton.solve(
-        linear_model(replace(random_equations(9), vector=np.zeros((9, 6))), None, (2, 3)),
+        linear_model(replace(random_equations(9), vector=np.zeros((9, 6)))),
         random_functions(9),
         np.zeros((3, 2, 3)),
         prior(1e3, (2, 3)),

@@ -18,7 +18,7 @@ from pdvc.volume import Grid, Volume, hull_of
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
 from simulator.truth import read_truth
-from tests.test_job import TINY
+from tests.tiny_scenarios import TINY
 from validation import spam as room
 from validation.methods import MethodError, find_method
 from validation.scores import score

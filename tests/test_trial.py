@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from pdvc.options import MeasureOptions, StageOptions
-from simulator.scenario import Scenario
-from tests.test_job import TINY
+from tests.tiny_scenarios import trial
 from validation import trial as room
-from validation.trial import BOUND_COLUMNS, Trial, Volumes, clean_parts, score_columns
-
-FAST = {"rigid": (StageOptions(scale="coarse", most=2),), "deformation": (StageOptions(scale=1, most=2),)}
-
-
-def trial(options=None, **changes):
-    values = tomllib.loads(TINY)
-    for key, value in changes.items():
-        values[key] = {**values[key], **value} if isinstance(values.get(key), dict) else value
-    scenario = Scenario.parse(values, where="trial")
-    return Trial(scenario=scenario, options=MeasureOptions(**FAST, **(options or {})), factors={})
+from validation.trial import BOUND_COLUMNS, Volumes, clean_parts, score_columns
 
 
 def without_times(scores):
