@@ -1,4 +1,4 @@
-"""A small textured sample in a small scanner, and the projector written anew in plain numpy, with S stored."""
+"""A small textured sample in a small scanner, a blob in closed form, and the projector written anew in plain numpy."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pdvc.equations import Images, linearise
 from pdvc.experiment import Series
@@ -15,8 +15,8 @@ from pdvc.history import Angle, Polynomial, time_basis
 from pdvc.projection import project
 from pdvc.rays import ray_vectors
 from pdvc.sections import SectionBasis
-from pdvc.volume import Volume
-from validation.small_cases import placed_volume, textured_volume
+from pdvc.volume import Grid, Volume
+from validation.small_cases import hull_around, placed_volume, textured_volume
 
 Floats = NDArray[np.float64]
 
@@ -156,3 +156,54 @@ def radiographs(basis: SectionBasis, amplitude: Floats, volume: Volume | None = 
 def lineariser(images: Images, basis: SectionBasis):  # type: ignore[no-untyped-def]
     """Return the equations as a function of amplitudes, as solvers ask for them."""
     return lambda amplitude: linearise(images, basis, amplitude)
+
+
+# A volume in closed form
+
+BLOB_CENTRE = np.array([0.11, -0.07, 0.05])
+BLOB_SHAPE = np.array([[40.0, 9.0, 0.0], [9.0, 70.0, -12.0], [0.0, -12.0, 30.0]])
+"""Inverse covariance of the blob, 1 / mm^2."""
+
+
+def pixel_directions(rays: Floats, shape: tuple[int, int]) -> Floats:
+    """Return the unit vectors (row, column, 3) from the source to the pixels."""
+    row, column = np.indices(shape)
+    d = rays[1] + row[..., None] * rays[2] + column[..., None] * rays[3] - rays[0]
+    return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
+
+
+def blob_values(points: Floats) -> Floats:
+    """Return F(x) (...,) at points (..., 3), mm."""
+    away = points - BLOB_CENTRE
+    return np.asarray(np.exp(-0.5 * np.einsum("...a,ab,...b->...", away, BLOB_SHAPE, away)))
+
+
+def blob_gradients(points: Floats) -> Floats:
+    """Return grad F (..., 3) at points (..., 3), 1 / mm."""
+    return np.asarray(-((points - BLOB_CENTRE) @ BLOB_SHAPE) * blob_values(points)[..., None])
+
+
+def blob(voxel_mm: float) -> Volume:
+    """Return a volume of F(x) = exp(-(x - c)^T A (x - c) / 2), reaching to where it is below single precision."""
+    count = np.round(np.array([2.2, 1.5, 1.8]) / voxel_mm).astype(int)
+    grid = Grid(
+        shape=tuple(int(n) for n in count),
+        voxel_mm=voxel_mm,
+        origin_mm=tuple(float(-(n - 1) / 2 * voxel_mm) for n in count[::-1]),
+    )
+    z, y, x = np.meshgrid(
+        *(o + voxel_mm * np.arange(n) for o, n in zip(grid.origin_mm[::-1], count, strict=True)), indexing="ij"
+    )
+    values = blob_values(np.stack([x, y, z], axis=-1)).astype(np.float32)
+    for axis in range(3):
+        np.moveaxis(values, axis, 0)[[0, -1]] = 0
+    return Volume(values=values, grid=grid, hull=hull_around(values, grid))
+
+
+def blob_integrals(rays: Floats, shape: tuple[int, int], shift_mm: ArrayLike = (0.0, 0.0, 0.0)) -> Floats:
+    """Return the exact line integrals (row, column) of the blob, moved by a shift."""
+    d = pixel_directions(rays, shape)
+    p = rays[0] - BLOB_CENTRE - np.asarray(shift_mm)
+    dd = np.einsum("...a,ab,...b->...", d, BLOB_SHAPE, d)
+    pd = np.einsum("a,ab,...b->...", p, BLOB_SHAPE, d)
+    return np.asarray(np.sqrt(2 * np.pi / dd) * np.exp(-0.5 * (p @ BLOB_SHAPE @ p - pd**2 / dd)))

@@ -22,6 +22,8 @@ from tests.small_case import (
     SECTIONS,
     SHAPE,
     VOXEL_MM,
+    blob,
+    blob_integrals,
     motion,
     plane_sums,
     rays_at,
@@ -29,13 +31,9 @@ from tests.small_case import (
     textured,
     volume_of,
 )
-from validation.small_cases import hull_around
 
 BLANK = np.zeros(SHAPE, dtype=np.float32)
 EVEN = np.ones(SHAPE, dtype=np.float32)
-BLOB_CENTRE = np.array([0.11, -0.07, 0.05])
-BLOB_SHAPE = np.array([[40.0, 9.0, 0.0], [9.0, 70.0, -12.0], [0.0, -12.0, 30.0]])
-"""Inverse covariance of the blob, 1 / mm^2."""
 
 
 def project(volume, rays, shape, basis, amplitude, *, voxel_mm):
@@ -53,35 +51,6 @@ def normal_equations(volume, rays, basis, amplitude, target, weight, *, voxel_mm
     )
 
 
-def blob(voxel_mm):
-    """Return a volume of F(x) = exp(-(x - c)^T A (x - c) / 2), reaching to where it is below single precision."""
-    count = np.round(np.array([2.2, 1.5, 1.8]) / voxel_mm).astype(int)
-    grid = Grid(
-        shape=tuple(int(n) for n in count),
-        voxel_mm=voxel_mm,
-        origin_mm=tuple(float(-(n - 1) / 2 * voxel_mm) for n in count[::-1]),
-    )
-    z, y, x = np.meshgrid(
-        *(o + voxel_mm * np.arange(n) for o, n in zip(grid.origin_mm[::-1], count, strict=True)), indexing="ij"
-    )
-    away = np.stack([x, y, z], axis=-1) - BLOB_CENTRE
-    values = np.exp(-0.5 * np.einsum("...a,ab,...b->...", away, BLOB_SHAPE, away)).astype(np.float32)
-    for axis in range(3):
-        np.moveaxis(values, axis, 0)[[0, -1]] = 0
-    return Volume(values=values, grid=grid, hull=hull_around(values, grid))
-
-
-def blob_integrals(rays, shift_mm=(0.0, 0.0, 0.0)):
-    """Return the exact line integrals (row, column) of the blob, moved by a shift."""
-    row, column = np.indices(SHAPE)
-    d = rays[1] + row[..., None] * rays[2] + column[..., None] * rays[3] - rays[0]
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    p = rays[0] - BLOB_CENTRE - np.asarray(shift_mm)
-    dd = np.einsum("...a,ab,...b->...", d, BLOB_SHAPE, d)
-    pd = np.einsum("a,ab,...b->...", p, BLOB_SHAPE, d)
-    return np.sqrt(2 * np.pi / dd) * np.exp(-0.5 * (p @ BLOB_SHAPE @ p - pd**2 / dd))
-
-
 def still(basis=ONE):
     return np.zeros(basis.shape)
 
@@ -89,7 +58,7 @@ def still(basis=ONE):
 @pytest.mark.parametrize("angle", [0.0, 0.8, 4.0])
 def test_line_integrals_converge_to_the_closed_form_with_the_square_of_the_voxel(angle):
     rays = rays_at(angle)
-    exact = blob_integrals(rays)
+    exact = blob_integrals(rays, SHAPE)
     sizes = (0.06, 0.03, 0.015)
     errors = [
         np.sqrt(np.mean((project(blob(h), rays, SHAPE, ONE, still(), voxel_mm=VOXEL_MM) - exact) ** 2)) / exact.max()
@@ -105,7 +74,7 @@ def test_a_translated_blob_is_where_the_translation_takes_it():
     amplitude = still()
     amplitude[0, :3] = [2.3, -1.7, 3.1]
     moved = project(blob(0.025), rays, SHAPE, ONE, amplitude, voxel_mm=VOXEL_MM)
-    exact = blob_integrals(rays, VOXEL_MM * amplitude[0, :3])
+    exact = blob_integrals(rays, SHAPE, VOXEL_MM * amplitude[0, :3])
     # the same error as that of the still blob: 0.05 voxel more would double it
     assert np.sqrt(np.mean((moved - exact) ** 2)) < 7e-4 * exact.max()
 
