@@ -15,9 +15,7 @@ from hypothesis import strategies as st
 from pdvc import gauss_newton, pgd
 from pdvc.equations import linearise, residuals
 from pdvc.prior import Prior
-from pdvc.sections import SectionBasis
 from pdvc.systematic import Systematic
-from pdvc.uncertainty import posterior
 from tests.linear_problems import chi2_of, linear_model, random_equations, random_functions
 from tests.small_case import (
     SECTIONS,
@@ -111,7 +109,7 @@ def test_pgd_comes_to_gauss_newton_s_solution_with_enough_modes():
     np.testing.assert_allclose(greedy.coefficients, direct.coefficients, atol=1e-4)
 
 
-# Prior and posterior
+# The prior
 
 
 @pytest.mark.parametrize("solver", ["pgd", "gauss-newton"])
@@ -141,80 +139,6 @@ def test_a_strong_prior_pulls_back_to_no_motion_from_a_start():
         least_change_voxel=1e-9,
     )
     assert np.abs(found.coefficients).max() < 1e-3
-
-
-def test_without_data_the_posterior_is_the_prior():
-    blank = replace(random_equations(1), matrix=np.zeros((9, 6, 6)), vector=np.zeros((9, 6)))
-    functions = random_functions(1)
-    known = posterior(blank, functions, prior(2.5, (2, 3)))
-    expected = 2.5 * np.sqrt((functions**2).sum(axis=0))
-    np.testing.assert_allclose(known.deviation, np.broadcast_to(expected[:, None, None], (9, 2, 3)), rtol=1e-9)
-    np.testing.assert_allclose(known.data_share, 0, atol=1e-9)
-    assert not known.observed.any()
-
-
-def test_without_any_residual_the_posterior_knows_what_the_data_see_and_no_more():
-    equations, functions = random_equations(1), random_functions(1)
-    matrix = equations.matrix.copy()
-    matrix[:, 3:] = 0
-    matrix[:, :, 3:] = 0
-    perfect = replace(equations, matrix=matrix, vector=0 * equations.vector, chi2=0 * equations.chi2)
-    known = posterior(perfect, functions, prior(30, (2, 3)))
-    before = 30 * np.sqrt((functions**2).sum(axis=0))
-    assert (known.deviation[:, 0] < 1e-6 * before[:, None]).all()
-    np.testing.assert_allclose(known.deviation[:, 1], np.broadcast_to(before[:, None], (9, 3)), rtol=1e-9)
-    np.testing.assert_array_equal(known.observed, [True, False])
-
-
-def test_the_data_s_share_is_what_they_took_of_the_prior_s_variance():
-    equations, functions, believed = random_equations(2), random_functions(2), prior(0.3, (2, 3))
-    known = posterior(equations, functions, believed)
-    before = 0.3**2 * (functions**2).sum(axis=0)[:, None, None]
-    np.testing.assert_allclose(known.data_share, 1 - known.deviation**2 / before, atol=1e-9)
-    assert ((known.data_share > 0) & (known.data_share < 1)).all()
-
-
-def test_more_data_never_make_an_amplitude_less_known():
-    equations, functions, believed = random_equations(6), random_functions(6), prior(0.3, (2, 3))
-    once = posterior(equations, functions, believed)
-    # every pixel seen twice, with the same rms residual
-    twice = replace(equations, matrix=2 * equations.matrix, chi2=2 * equations.chi2, pixels=2 * equations.pixels)
-    assert (posterior(twice, functions, believed).deviation < once.deviation).all()
-
-
-def test_posterior_deviations_are_the_scatter_over_noise_draws():
-    """Sensitivities of the small sample, linear model: 300 draws of white noise, the direct solve of each."""
-    noise = 0.02
-    start = equations_of(ZERO)
-    functions, believed = time_functions(), prior(1e3)
-    rng = np.random.default_rng(11)
-    pixels = SHAPE[0] * SHAPE[1]
-    roots = [np.linalg.cholesky(b + 1e-9 * np.trace(b) * np.eye(UNKNOWNS)) for b in start.matrix]
-    hessian = sum(np.kron(np.outer(functions[:, t], functions[:, t]), start.matrix[t]) for t in range(STEPS))
-    draws = []
-    for _ in range(300):
-        # c = S^T noise has covariance noise^2 B, whatever S
-        c = noise * np.stack([root @ rng.normal(size=UNKNOWNS) for root in roots])
-        solved = np.linalg.solve(hessian, (functions @ c).ravel()).reshape(FUNCTIONS, UNKNOWNS)
-        draws.append(functions.T @ solved)
-    scatter = np.std(draws, axis=0).reshape(STEPS, *SECTIONS.shape)
-    noisy = replace(start, chi2=np.full(STEPS, pixels * noise**2))
-    # a deviation from 300 draws is known to 4 %
-    ratio = posterior(noisy, functions, believed).deviation / scatter
-    assert np.abs(ratio - 1).max() < 0.2
-    assert np.abs(ratio.mean() - 1) < 0.03
-
-
-def test_a_section_out_of_the_window_is_unobserved():
-    """The window sees 1.2 mm up and down; a section's hat reaches to its neighbours."""
-    far = SectionBasis(height_mm=np.array([-1.2, 0.0, 1.25, 1.4, 1.55]), radius_mm=0.5)
-    images = radiographs(far, np.zeros((STEPS, *far.shape)))
-    known = posterior(linearise(images, far, np.zeros((STEPS, *far.shape))), time_functions(), prior(1.0, far.shape))
-    np.testing.assert_array_equal(known.observed, [True, True, True, False, False])
-    expected = np.sqrt((time_functions() ** 2).sum(axis=0))
-    np.testing.assert_allclose(
-        known.deviation[:, 3:], np.broadcast_to(expected[:, None, None], (STEPS, 2, 6)), rtol=1e-6
-    )
 
 
 # The inverse crime on purpose
