@@ -158,6 +158,22 @@ def test_bending_and_torsion_turn_the_ends_by_their_angle():
     assert length == pytest.approx(12, abs=1e-6)
 
 
+@pytest.mark.parametrize("ingredient", ["bending", "torsion"])
+def test_similar_sections_give_way_to_a_moment_by_their_second_moment_of_area(ingredient):
+    """Euler and Bernoulli: curvature = M / (E I), with I = integral of y^2 over the section, by quadrature here.
+
+    A shaft of similar sections twists by the same law. Ligament and ends differ by a factor 57 in I.
+    """
+    half = np.sqrt(AREA) / 2  # of a square section
+    y, weight = np.polynomial.legendre.leggauss(4)
+    moment = 2 * half * half * ((half[:, None] * y) ** 2 @ weight)
+    (motion,) = paper_motion(ingredients=(ingredient,)).motions
+    curvature = np.gradient(np.linalg.norm(motion.rotation_rad[-1], axis=1) * np.sign(HEIGHT), HEIGHT)
+    inner = slice(5, -5)
+    assert moment.max() > 50 * moment.min()
+    np.testing.assert_allclose((curvature * moment)[inner], (curvature * moment)[len(HEIGHT) // 2], rtol=0.02)
+
+
 def test_compliance_is_in_proportion_to_the_force():
     options = Compliance(shift_mm=(0.1, 0.0, -0.2), tilt_deg=(0.0, 0.0, 0.0))
     motion = paper_motion(ingredients=("compliance",), compliance=options)

@@ -66,8 +66,10 @@ def dense(field: Sensitivities, unknowns: int) -> np.ndarray:
 
 @pytest.mark.parametrize("angle", [0.3, 1.2])
 def test_sensitivities_of_a_blob_converge_to_the_integrals_of_its_gradient_at_steep_rays(angle):
-    """Eq. 10 by quadrature of the closed form. Where a ray crosses a section, the weight of what is integrated by
-    parts jumps, so that the order is less than two there."""
+    """Eq. 10 by quadrature of the closed form.
+
+    Where a ray crosses a section, the weight of what is integrated by parts jumps: the order is less than two there.
+    """
     rays = rays_at(angle, STEEP)
     along = np.linspace(-1.6, 1.6, 201)
     middle = rays[0] + STEEP.source_axis_mm * pixel_directions(rays, STEEP_SHAPE)[::3, ::3, None]
