@@ -71,10 +71,24 @@ def test_maps_without_truth_have_one_panel(case):
         assert len(figure.axes) == 2  # the map and its colour bar
 
 
-def test_errors_of_a_perfect_measurement_can_be_drawn(tmp_path):
+@pytest.mark.parametrize(
+    ("errors", "scale"),
+    [(np.zeros((5, 3)), "linear"), (np.geomspace(1e-3, 2, 15).reshape(5, 3) - 1e-3, "log")],
+    ids=["a perfect measurement", "errors over decades"],
+)
+def test_errors_are_drawn_as_they_are_but_for_those_of_zero_which_a_logarithm_has_no_place_for(errors, scale):
     figure, (ax,) = figures.new_figure(7, 3)
-    figures.draw_errors(np.zeros((5, 3)), ax)
-    figure.savefig(tmp_path / "errors.png")
+    figures.draw_errors(errors, ax)
+    figure.draw_without_rendering()
+    assert ax.get_yscale() == scale
+    low, high = ax.get_ylim()
+    assert len(ax.lines) == 3
+    for line, values in zip(ax.lines, errors.T, strict=True):
+        drawn = np.asarray(line.get_ydata())
+        np.testing.assert_array_equal(np.isnan(drawn), values == 0)
+        np.testing.assert_array_equal(drawn[values > 0], values[values > 0])
+        assert (low <= drawn[values > 0]).all()
+        assert (drawn[values > 0] <= high).all()
 
 
 def test_errors_by_step(case):

@@ -1,0 +1,61 @@
+"""What solvers start from: which pixels of the coarse radiographs count."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pdvc.options import resolved
+from pdvc.preparation import calibrated, prepare, used_window
+from pdvc.progress import silent
+from pdvc.store import Store
+from validation.small_cases import SmallExperiment, small_scenario
+
+SMALL = SmallExperiment(small_scenario({"detector.bad_pixel_fraction": 0.0}))
+
+
+def with_dead_pixels(experiment, places):
+    """Return the experiment, seen by a detector some pixels of which answer nothing but the dark."""
+    rows, columns = np.array(places).T
+
+    def seen(counts):
+        changed = counts.copy()
+        changed[:, rows, columns] = experiment.darks[0][rows, columns]
+        return changed
+
+    return replace(
+        experiment,
+        flats=seen(experiment.flats),
+        reference=replace(experiment.reference, counts=seen(experiment.reference.counts)),
+        test=replace(experiment.test, counts=seen(experiment.test.counts)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("scale", "dead", "counts"),
+    [
+        (2, [(0, 0)], True),
+        (2, [(0, 0), (1, 1)], False),
+        (2, [(0, 0), (0, 1), (1, 0)], False),
+        (3, [(0, 0), (2, 1)], True),
+        (3, [(0, 0), (2, 1), (1, 2)], False),
+    ],
+)
+def test_a_coarse_pixel_counts_where_more_than_two_thirds_of_it_were_measured(scale, dead, counts):
+    """A dead pixel takes its neighbours' mean: a coarse pixel that is made of such means by a third tells nothing new.
+
+    One dead pixel of four is let pass, or a detector with one in a hundred would lose four at the coarse scale.
+    """
+    options = resolved(SMALL.options, SMALL.experiment.geometry)
+    row, column = 12 * scale, 6 * scale
+    experiment = with_dead_pixels(SMALL.experiment, [(row + i, column + j) for i, j in dead])
+    store = Store(None, experiment)
+    calibration, outline = calibrated(experiment, options, store, silent)
+    assert calibration.bad.sum() == len(dead)
+    window = used_window(experiment.geometry, options)
+    weight = prepare(experiment, calibration, outline, window, scale, options, store, silent).images.weight[0]
+    expected = np.ones_like(weight)
+    expected[12 - window[0] // scale, 6 - window[2] // scale] = counts
+    np.testing.assert_array_equal(weight, expected)
