@@ -50,3 +50,22 @@ bench: .venv-bench/.installed
 .PHONY: bad-inputs
 bad-inputs: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.bad_inputs
+# every law of the tests on EXAMPLES examples, those through the whole pipeline on a tenth; tells how many were tried
+.PHONY: laws
+EXAMPLES ?= 300
+laws: $(VENV)/.installed-test
+	PDVC_LAW_EXAMPLES=$(EXAMPLES) $(BIN)/python -m pytest -m hypothesis -n 2 --dist worksteal
+
+# plant MUTANTS faults, drawn by SEED, one after the other in a copy of the project, for MINUTES at most, and run the
+# tests of each fault's module: docs/mutants.md. Makes an environment of its own, with the extra `mutants`
+.PHONY: mutants
+MUTANTS ?= 60
+MINUTES ?= 25
+SEED ?= 1
+mutants: .venv-mutants/.installed
+	.venv-mutants/bin/python -m tests.mutants --mutants $(MUTANTS) --minutes $(MINUTES) --seed $(SEED)
+
+.venv-mutants/.installed: pyproject.toml
+	$(PYTHON) -m venv .venv-mutants
+	.venv-mutants/bin/pip install --quiet --disable-pip-version-check --editable '.[mutants]'
+	touch $@

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc import gauss_newton
 from pdvc.gauss_newton import blocks_of
 from pdvc.prior import Prior
+from tests.laws import law
 from tests.linear_problems import linear_model, random_equations
 from tests.small_case import SECTIONS, STEPS, lineariser, radiographs
 
@@ -34,7 +35,7 @@ def groups_of(labels, seed):
 
 
 @given(st.lists(st.integers(0, 3), min_size=9, max_size=9), st.integers(0, 10**6))
-@settings(deadline=None, max_examples=30)
+@law(30)
 def test_blocks_give_the_dense_solution(labels, seed):
     """One pass on a linear problem, against numpy's solve of the whole system with each block's own prior."""
     equations, functions = random_equations(seed, shape=SHAPE), groups_of(labels, seed)

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.ndimage import gaussian_filter
@@ -16,6 +16,7 @@ from simulator.detector import (
     focal_blur_px,
     pixel_means,
 )
+from tests.laws import law
 
 PLAIN = Detector(bad_pixel_fraction=0.0, gain_spread=0.0, beam_falloff=0.0, blur_px=0.0)
 
@@ -33,7 +34,7 @@ def even(value, rows=200, columns=160):
     st.sampled_from([1, 2, 4]),
     st.floats(0, 1.5),
 )
-@settings(max_examples=50, deadline=None)
+@law(50)
 def test_pixel_means_are_a_gaussian_filter_and_then_the_mean_of_each_pixel(image, subpixels, blur_px):
     blurred = gaussian_filter(image.astype(float), blur_px * subpixels, mode="nearest", truncate=8)
     whole = blurred.reshape(12 // subpixels, subpixels, 20 // subpixels, subpixels).mean(axis=(1, 3))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import tifffile
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc.experiment import (
@@ -19,6 +19,7 @@ from pdvc.experiment import (
     read_experiment,
     write_description,
 )
+from tests.laws import law
 
 ROWS, COLUMNS = 6, 4
 
@@ -290,7 +291,7 @@ def test_a_wrong_entry_is_named_by_its_key(folder, old, new, message):
     assert message in found
 
 
-@settings(deadline=None, max_examples=25)
+@law(25)
 @given(st.integers(1, 40), st.lists(st.integers(0, 40), max_size=4))
 def test_a_stack_goes_on_where_the_last_writer_stopped(tmp_path_factory, size, stops):
     path = tmp_path_factory.mktemp("stack") / "stack.tif"

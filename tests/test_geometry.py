@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc.geometry import ConeBeam
 from pdvc.rays import directions, ray_vectors
+from tests.laws import law
 from validation.strategies import angles_rad, cone_beams
 
 SCANNER = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=60, columns=44)
@@ -60,7 +61,7 @@ def test_beam_column_and_row_are_right_handed_unit_vectors(angle):
     np.testing.assert_allclose([beam @ beam, column @ column, beam @ column], [1, 1, 0], atol=1e-12)
 
 
-@settings(deadline=None)
+@law()
 @given(cone_beams(), angles_rad(), st.data())
 def test_a_cropped_window_looks_along_the_same_rays(geometry, angle, data):
     row_from = data.draw(st.integers(0, geometry.rows - 1))
@@ -76,7 +77,7 @@ def test_a_cropped_window_looks_along_the_same_rays(geometry, angle, data):
     )
 
 
-@settings(deadline=None)
+@law()
 @given(cone_beams(), angles_rad(), st.integers(1, 7))
 def test_a_binned_pixel_stands_at_the_mean_of_its_block_whatever_is_left_over(geometry, angle, factor):
     coarse = geometry.binned(factor)

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc.experiment import Series
 from pdvc.history import PAPER, Angle, Force, Fourier, Polynomial, Ramp, Splines, Steps, time_basis
+from tests.laws import law
 
 
 def series(steps=127, *, loading_from=50):
@@ -51,7 +52,7 @@ PARTS = st.sampled_from(
 )
 
 
-@settings(deadline=None)
+@law()
 @given(st.lists(PARTS, min_size=1, max_size=5), st.integers(30, 60))
 def test_the_basis_is_orthonormal_in_the_mean_over_steps_and_spans_all_parts(parts, steps):
     record = series(steps, loading_from=20)

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -20,9 +20,10 @@ from simulator.ingredients import (
 from simulator.kinematics import BeamMotion, Composition, MotionError, RigidMotion, SectionMotion, rotation_matrix
 from simulator.loading import Loading, load_history
 from simulator.specimen import Specimen, area_mm2
+from tests.laws import law
 from validation.strategies import beam_motions, motions, rigid_motions, section_motions
 
-FEW = settings(max_examples=40, deadline=None)
+FEW = law(40)
 ANGLE = 2 * np.pi * np.arange(127) / 50
 HEIGHT = np.linspace(-6.5, 6.5, 261)
 AREA = area_mm2(Specimen(thinned="both"), HEIGHT)

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simulator.scenario import course_of
 from tests import synthetic_records as records
+from tests.laws import law
 from validation.noise_floor import constant_load_steps, noise_floor, without_rigid_motion
 from validation.small_cases import SmallExperiment, small_scenario
 
@@ -49,7 +50,7 @@ def loaded(constant, rising, rate, level=250.0):
     return level + rate * np.clip(np.arange(constant + rising) - constant + 1, 0, None)
 
 
-@settings(max_examples=100, deadline=None)
+@law(100)
 @given(st.integers(5, 60), st.integers(0, 60), st.floats(0.01, 1e3), st.floats(1.0, 1e4), st.booleans())
 def test_without_noise_the_constant_load_ends_at_the_last_step_before_the_force_rises(
     constant, rising, rate, level, pulled
@@ -95,7 +96,7 @@ def test_a_rigid_motion_however_it_changes_is_no_noise():
         assert max(vars(part).values()) < 1e-9
 
 
-@settings(max_examples=50, deadline=None)
+@law(50)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9))
 def test_less_its_rigid_motion_nothing_rigid_is_left_and_nothing_else_is_lost(seed, levels):
     rng = np.random.default_rng(seed)

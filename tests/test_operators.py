@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -18,6 +18,7 @@ from pdvc.rays import ray_vectors
 from pdvc.reconstruction import _filtered, _ramp
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
 from pdvc.systematic import Systematic
+from tests.laws import law
 from tests.operators import dottest
 from tests.small_case import (
     SCANNER,
@@ -129,7 +130,7 @@ def test_c_is_the_adjoint_of_the_projection_s_slope(name, scanner, angle, now, r
     dottest(forward, adjoint, (CLOSE.shape[0],), shape, rtol=rtol)
 
 
-@settings(deadline=None, max_examples=8)
+@law(8)
 @given(cone_beams(), st.floats(-3.0, 3.0), st.integers(0, 99), st.floats(0.0, 3.0))
 def test_s_and_its_transpose_in_c_and_b_are_one_operator(scanner, angle, seed, turned):
     """On whatever scanner: `sensitivities` gives S, `normal_equations` S^T W rho and S^T W S."""
@@ -160,7 +161,7 @@ def test_s_and_its_transpose_in_c_and_b_are_one_operator(scanner, angle, seed, t
 # Displacements
 
 
-@settings(deadline=None, max_examples=20)
+@law(20)
 @given(section_bases(motions=(*RIGID, CONTRACTION)), st.integers(0, 99))
 def test_shapes_are_the_adjoint_of_the_displacement(basis, seed):
     low, high = basis.height_mm[[0, -1]]
@@ -178,7 +179,7 @@ def test_shapes_are_the_adjoint_of_the_displacement(basis, seed):
 # Registration of the systematic residual
 
 
-@settings(deadline=None, max_examples=25)
+@law(25)
 @given(
     st.sampled_from((SCANNER, STEEP)),
     st.floats(-3.0, 3.0),
@@ -225,7 +226,7 @@ def in_air(image: np.ndarray, margin: int) -> np.ndarray:
     return np.pad(image, margin)
 
 
-@settings(deadline=None, max_examples=20)
+@law(20)
 @given(st.floats(0.1, 3.0), st.integers(5, 12), st.integers(5, 12), st.integers(0, 99))
 def test_the_filter_of_radiographs_is_its_own_adjoint(smooth_px, rows, columns, seed):
     margin = int(4 * smooth_px) + 1
@@ -240,7 +241,7 @@ def test_the_filter_of_radiographs_is_its_own_adjoint(smooth_px, rows, columns, 
     dottest(forward, adjoint, (rows, columns), shape, seed=seed, rtol=1e-12)
 
 
-@settings(deadline=None, max_examples=20)
+@law(20)
 @given(st.integers(1, 4), st.integers(2, 6), st.integers(2, 6), st.integers(0, 99))
 def test_the_adjoint_of_binning_shares_a_coarse_pixel_out_and_that_of_coarsening_filters_it_then(
     factor, rows, columns, seed
@@ -267,7 +268,7 @@ def test_the_adjoint_of_binning_shares_a_coarse_pixel_out_and_that_of_coarsening
     dottest(forward, adjoint, shape, whole, seed=seed)
 
 
-@settings(deadline=None, max_examples=10)
+@law(10)
 @given(cone_beams(), st.integers(0, 99))
 def test_the_ramp_filter_is_its_own_adjoint_and_takes_nothing_away_but_the_mean(scanner, seed):
     """The band-limited ramp is even, and positive but at frequency zero: <p, h * p> > 0."""

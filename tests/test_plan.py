@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc.experiment import Series, read_experiment
@@ -16,6 +16,7 @@ from pdvc.measure import measure
 from simulator.scanner import simulate
 from simulator.truth import read_truth
 from tests.command_line import pdvc_bench
+from tests.laws import law
 from tests.tiny_scenarios import TINY, trial
 from validation.calibration import calibration
 from validation.plan import _stretched, designs_around, plan
@@ -107,7 +108,7 @@ def test_a_test_that_hardly_turns_hides_what_moves_along_its_beam(beam_deg, phot
     assert (f"{invisible} known to no better than 0.5 voxel" in caption) == (invisible > 0)
 
 
-@settings(deadline=None, max_examples=30)
+@law(30)
 @given(
     st.integers(2, 4),
     st.integers(8, 20),

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -16,6 +16,7 @@ from pdvc.projection import StepEquations
 from pdvc.rays import ray_vectors
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
 from pdvc.volume import Grid, Volume
+from tests.laws import law
 from tests.small_case import (
     ONE,
     SCANNER,
@@ -175,7 +176,7 @@ def test_sensitivities_are_the_slope_of_the_projection(basis, section, kind):
     assert np.sqrt(found.matrix[at, at]) == pytest.approx(np.sqrt((slope**2).sum()), rel=1e-2)
 
 
-@settings(deadline=None, max_examples=15)
+@law(15)
 @given(st.tuples(*[st.integers(-3, 3)] * 3), st.floats(-3, 3))
 def test_a_translation_by_whole_voxels_is_the_volume_shifted(shift, angle):
     values = np.pad(textured().values, 4)
@@ -188,7 +189,7 @@ def test_a_translation_by_whole_voxels_is_the_volume_shifted(shift, angle):
     np.testing.assert_allclose(warped, shifted, atol=2e-6 * shifted.max())
 
 
-@settings(deadline=None, max_examples=15)
+@law(15)
 @given(st.integers(1, 6), st.integers(0, 1000), st.floats(-3, 3))
 def test_the_number_of_sections_does_not_change_the_same_rigid_motion(sections, seed, angle):
     basis = SectionBasis(height_mm=np.linspace(-1.1, 1.2, sections), radius_mm=0.3)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -24,6 +24,7 @@ from pdvc.radiographs import (
     snr_db,
 )
 from pdvc.rays import ray_vectors
+from tests.laws import law
 from validation.strategies import cone_beams
 
 ROWS, COLUMNS = 31, 22
@@ -69,7 +70,7 @@ def test_known_attenuation_comes_back_from_counts():
     np.testing.assert_allclose(grey_levels(counts, calibration), attenuation, atol=0.5 / 1900)
 
 
-@settings(deadline=None, max_examples=30)
+@law(30)
 @given(st.tuples(*[st.floats(-0.5, 1.0, width=32)] * 3))
 def test_the_polynomial_is_that_of_the_attenuation(coefficients):
     rng = np.random.default_rng(2)
@@ -187,7 +188,7 @@ def test_coarse_images_keep_constants(factor):
     np.testing.assert_allclose(coarse, 0.7, rtol=1e-6)
 
 
-@settings(deadline=None)
+@law()
 @given(cone_beams(), st.integers(1, 3))
 def test_a_coarse_image_of_where_pixels_are_says_where_the_binned_geometry_s_pixels_are(geometry, factor):
     """Colour each pixel by its place; filtered and binned, that is the place of the coarse pixel."""
@@ -213,7 +214,7 @@ def test_a_coarse_image_is_the_gaussian_s_block_mean():
     assert coarsened(image, 3)[3, 2] == pytest.approx(expected, abs=2e-3)
 
 
-@settings(deadline=None)
+@law()
 @given(st.floats(0.01, 100), st.floats(-5, 5), st.integers(0, 99))
 def test_snr_is_20_db_for_each_factor_of_ten_whatever_the_offsets(scale, offset, seed):
     signal = np.random.default_rng(seed).normal(size=(9, 8)).astype(np.float32)

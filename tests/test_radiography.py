@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc.geometry import ConeBeam
@@ -19,6 +19,7 @@ from simulator import radiography
 from simulator.microstructure import Graphite, place
 from simulator.radiography import Body, path_lengths
 from simulator.specimen import Specimen, dog_bone, section_mm, turn_back
+from tests.laws import law
 from validation.strategies import angles_rad, cone_beams
 
 SCANNER = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=60, columns=44)
@@ -78,7 +79,7 @@ shapes = st.lists(st.floats(-0.5, 0.5), min_size=9, max_size=9).map(
 points = st.lists(st.floats(-0.8, 0.8), min_size=3, max_size=3).map(np.array)
 
 
-@settings(deadline=None)
+@law()
 @given(cone_beams(), angles_rad(), points, shapes, st.integers(1, 3))
 def test_nodule_chords_are_those_of_the_ellipsoid(geometry, angle_rad, centre, shape, subpixels):
     matrix, graphite = path_lengths(body(None, [centre], [shape]), geometry, angle_rad, subpixels)
@@ -99,7 +100,7 @@ def test_small_nodules_are_exact_far_from_the_axis():
     np.testing.assert_allclose(graphite, expected, atol=1e-6)
 
 
-@settings(deadline=None)
+@law()
 @given(cone_beams(), angles_rad(), st.integers(1, 3))
 def test_surface_chords_are_those_of_the_box(geometry, angle_rad, subpixels):
     half = np.array([0.7, 0.4, 0.5])
@@ -150,7 +151,7 @@ def test_chords_through_a_deformed_dog_bone_agree_with_quadrature():
         assert matrix[i, j] == pytest.approx(1e-3 * inside.sum(), abs=2.5e-3)
 
 
-@settings(max_examples=30, deadline=None)
+@law(30)
 @given(cone_beams(), angles_rad(), st.integers(0, 2**32 - 1), st.booleans())
 def test_no_ray_leaks(geometry, angle_rad, seed, aligned):
     """The signed crossings of every ray sum to exactly zero, for crumpled surfaces and for aligned edges."""
@@ -178,7 +179,7 @@ def test_no_ray_leaks_through_the_dog_bone_at_full_size():
     assert matrix.max() < 1.02 * 2 * np.hypot(*half)
 
 
-@settings(max_examples=15, deadline=None)
+@law(15)
 @given(angles_rad(), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), points)
 def test_rigid_motion_conserves_the_amount_of_matter(angle_rad, tilt, lean, centre):
     """A far source sees volume / pixel area as the sum of all path lengths, wherever the object is."""
@@ -230,7 +231,7 @@ def test_a_shifted_detector_moves_the_image_the_other_way_and_roll_turns_it():
 
 
 @given(cone_beams(), angles_rad(), st.integers(2, 4))
-@settings(max_examples=20, deadline=None)
+@law(20)
 def test_cropping_the_geometry_crops_the_image(geometry, angle_rad, factor):
     sample = body(trimesh.creation.icosphere(subdivisions=2, radius=0.8), [[0.2, 0.1, -0.3]], [0.3 * np.eye(3)])
     whole, _ = path_lengths(sample, geometry, angle_rad, 1)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -13,6 +13,7 @@ from pdvc.geometry import ConeBeam
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import angular_share, fdk, seen_half_height_mm
 from pdvc.volume import Grid, hull_of
+from tests.laws import law
 
 SCANNER = ConeBeam(source_axis_mm=40.0, source_detector_mm=400.0, pixel_mm=0.5, rows=44, columns=56)
 ANGLES = np.linspace(0, 2 * np.pi, 180, endpoint=False)
@@ -132,7 +133,7 @@ FULL_TURN = st.integers(19, 60).flatmap(
 )
 
 
-@settings(deadline=None)
+@law()
 @given(FULL_TURN, st.floats(-10, 10))
 def test_shares_add_up_to_half_a_turn_and_do_not_depend_on_the_start(angles, start):
     share = angular_share(angles)

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pdvc.measurement import MeasurementError
 from tests import synthetic_records as records
+from tests.laws import law
 from validation.axis import axis_history, measured_at
 from validation.scores import Errors, point_errors, score
 
@@ -79,7 +80,7 @@ components = arrays(
 
 
 @given(components)
-@settings(max_examples=100, deadline=None)
+@law(100)
 def test_squared_error_is_squared_bias_plus_squared_random(values):
     values = np.where(np.isfinite(values).all(axis=2, keepdims=True), values, np.nan)
     errors = Errors(components=values)
@@ -92,7 +93,7 @@ def test_squared_error_is_squared_bias_plus_squared_random(values):
 
 
 @given(st.floats(-0.1, 0.1), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
-@settings(max_examples=25, deadline=None)
+@law(25)
 def test_any_uniform_strain_and_translation_is_scored_exactly(strain, dx, dz):
     truth, amplitude = records.stretched([0.0, strain], [[0, 0, 0], [dx, -dx, dz]])
     result = score(records.measurement(amplitude), truth)

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
+from tests.laws import law
 from validation.strategies import section_bases
 
 NUMBERS = st.floats(-10.0, 10.0)
@@ -32,20 +33,20 @@ def displacement(basis, amplitude, point):
     return u
 
 
-@settings(deadline=None)
+@law()
 @given(section_bases(), arrays(float, 9, elements=NUMBERS))
 def test_hats_add_up_to_one(basis, z):
     np.testing.assert_allclose(basis.weights(z).sum(axis=-1), 1, atol=1e-12)
 
 
-@settings(deadline=None)
+@law()
 @given(section_bases(), st.floats(0, 1), NUMBERS, NUMBERS)
 def test_hats_reproduce_linear_functions_between_the_ends(basis, share, slope, level):
     z = basis.height_mm[0] + share * (basis.height_mm[-1] - basis.height_mm[0])
     np.testing.assert_allclose(basis.weights(z) @ (slope * basis.height_mm + level), slope * z + level, atol=1e-9)
 
 
-@settings(deadline=None)
+@law()
 @given(section_bases(), st.data())
 def test_displacement_follows_the_formula_with_cross_products(basis, data):
     amplitude = data.draw(arrays(float, basis.shape, elements=NUMBERS))
@@ -54,7 +55,7 @@ def test_displacement_follows_the_formula_with_cross_products(basis, data):
     np.testing.assert_allclose(basis.displacement(amplitude, points), expected, rtol=1e-9, atol=1e-7)
 
 
-@settings(deadline=None)
+@law()
 @given(section_bases(), section_bases(), POINTS, arrays(float, (1, 6), elements=NUMBERS))
 def test_sections_reproduce_the_motion_of_a_single_one_everywhere(basis, other, points, amplitude):
     single = SectionBasis(height_mm=other.height_mm[:1], radius_mm=other.radius_mm)

@@ -1,12 +1,13 @@
 """Records from TOML: what is wrong is named by its key, and what is written is read back."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from pdvc.experiment import Description
 from pdvc.history import Angle, Force, Polynomial, Ramp, Splines
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.settings import SettingsError, read_toml
+from tests.laws import law
 from validation.strategies import descriptions
 
 VALID = {
@@ -132,7 +133,7 @@ def read_back(record, folder):
     return type(record).read(path)
 
 
-@settings(deadline=None, max_examples=60)
+@law(60)
 @given(record=descriptions())
 def test_a_description_reads_back_as_it_was_written(tmp_path_factory, record):
     assert read_back(record, tmp_path_factory.mktemp("description")) == record

@@ -9,13 +9,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc import gauss_newton, pgd
 from pdvc.equations import linearise, residuals
 from pdvc.prior import Prior
 from pdvc.systematic import Systematic
+from tests.laws import law
 from tests.linear_problems import chi2_of, linear_model, random_equations, random_functions
 from tests.small_case import (
     SECTIONS,
@@ -42,7 +43,7 @@ def prior(deviation=1e3, shape=SECTIONS.shape):
 
 
 @given(st.integers(0, 10**6))
-@settings(deadline=None, max_examples=20)
+@law(20)
 def test_the_hessian_is_the_sum_of_kronecker_products(seed):
     equations, functions = random_equations(seed), random_functions(seed)
     expected = sum(
@@ -52,7 +53,7 @@ def test_the_hessian_is_the_sum_of_kronecker_products(seed):
 
 
 @given(st.integers(0, 10**6), st.floats(0.05, 10.0))
-@settings(deadline=None, max_examples=20)
+@law(20)
 def test_a_mode_fulfils_equations_12_to_17_with_the_prior_s_terms(seed, deviation):
     """Neither b at given a, nor a at given b, can lower chi2 + prior: written out element by element."""
     equations, functions = random_equations(seed), random_functions(seed)

@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from pdvc.settings import SettingsError
 from simulator.specimen import Specimen, area_mm2, depth_mm, dog_bone, section_mm, turn, turn_back
+from tests.laws import law
 
 
 def test_the_ligament_is_that_of_the_paper():
@@ -37,7 +38,7 @@ def test_the_grip_has_a_constant_section():
     np.testing.assert_array_equal(half_x, 1.5)
 
 
-@settings(max_examples=40, deadline=None)
+@law(40)
 @given(
     thinned=st.sampled_from(["x", "y", "both"]),
     radius=st.floats(2.0, 40.0),

@@ -16,6 +16,7 @@ from pdvc.prior import Prior
 from pdvc.sections import SectionBasis
 from pdvc.settings import SettingsError
 from simulator.scenario import Scenario, course_of
+from tests.laws import law
 from validation.scores import score
 from validation.small_cases import ProjectedCase, SmallExperiment, small_scenario
 from validation.strategies import amplitudes, projected_cases, scenarios, section_bases, small_experiments
@@ -24,7 +25,7 @@ FEW = settings(max_examples=3, deadline=None, derandomize=True)
 QUIET = settings(max_examples=100, deadline=None, derandomize=True, database=None)
 
 
-@settings(max_examples=50, deadline=None)
+@law(50)
 @given(scenarios())
 def test_scenarios_are_small_never_square_and_begin_with_a_turn_at_constant_load(scenario):
     plan, geometry = scenario.acquisition, scenario.geometry
@@ -37,7 +38,7 @@ def test_scenarios_are_small_never_square_and_begin_with_a_turn_at_constant_load
     assert (np.diff(force[plan.steps_per_turn - 1 :]) > 0)[1:].all()
 
 
-@settings(max_examples=50, deadline=None)
+@law(50)
 @given(scenarios())
 def test_what_is_printed_of_an_experiment_makes_it_again(scenario):
     names = {"SmallExperiment": SmallExperiment, "small_scenario": small_scenario}
@@ -100,7 +101,7 @@ def test_a_projected_case_is_solved_to_its_own_motion():
     np.testing.assert_allclose(found.coefficients, 0.3, atol=1e-2)
 
 
-@settings(max_examples=20, deadline=None)
+@law(20)
 @given(section_bases(), st.data())
 def test_amplitudes_fit_their_basis_and_keep_their_bound(basis, data):
     alone = data.draw(amplitudes(basis, largest_voxel=0.5))

@@ -14,12 +14,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from distributed import LocalCluster
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simulator.scenario import load_scenario
 from simulator.views import stream
 from tests.command_line import only_line, pdvc_bench
+from tests.laws import law
 from validation.runs import is_done
 from validation.study import Study, builtin_studies, combinations, study_file, trials_of
 
@@ -129,7 +130,7 @@ class TestDesigns:
         assert draws == draws[:2] * 4
         assert draws[0] != draws[1]
 
-    @settings(deadline=None, max_examples=30)
+    @law(30)
     @given(st.integers(1, 40), st.integers(0, 5), st.integers(1, 3))
     def test_a_latin_hypercube_meets_each_part_of_each_range_once(self, samples, seed, factors):
         keys = [

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.laws import law
 from validation.study import Study
 from validation.study_figures import study_pictures
 from validation.study_report import write_study_report
@@ -23,7 +24,7 @@ def test_two_draws_by_hand():
     assert np.isnan(found["error"].low)
 
 
-@settings(deadline=None, max_examples=30)
+@law(30)
 @given(st.integers(2, 12), st.integers(1, 30), st.integers(0, 99))
 def test_squares_add_up(repetitions, points, seed):
     errors = np.random.default_rng(seed).normal(1.0, 0.1, (repetitions, points))

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc.geometry import ConeBeam
 from pdvc.rays import ray_vectors
 from pdvc.sections import SectionBasis
 from pdvc.systematic import Systematic, neighbouring_views
+from tests.laws import law
 
 SCANNER = ConeBeam(source_axis_mm=200.0, source_detector_mm=2000.0, pixel_mm=0.5, rows=40, columns=30, roll_rad=0.0)
 VOXEL_MM = 0.05
@@ -42,7 +43,7 @@ def window(image, down=0, right=0):
     return image[WINDOW[0] + down : WINDOW[1] + down, WINDOW[2] + right : WINDOW[3] + right]
 
 
-@settings(deadline=None)
+@law()
 @given(st.integers(3, 40), st.data())
 def test_a_step_at_a_reference_angle_takes_that_view_alone(count, data):
     reference = np.linspace(0, 2 * np.pi, count, endpoint=False)
@@ -66,7 +67,7 @@ def test_a_step_after_the_last_view_wraps_around_to_the_first(angle):
     assert near.share[0] == pytest.approx(0.75)
 
 
-@settings(deadline=None)
+@law()
 @given(st.permutations(range(7)), st.floats(-9.0, 9.0))
 def test_views_in_any_order_and_any_step_give_its_angle_back(order, angle):
     ring = np.array([0.1, 0.9, 1.7, 3.0, 4.2, 5.0, 6.1])

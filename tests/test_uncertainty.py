@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc.equations import linearise
 from pdvc.prior import Prior
 from pdvc.sections import SectionBasis
 from pdvc.uncertainty import posterior
+from tests.laws import law
 from tests.linear_problems import random_equations, random_functions
 from tests.small_case import SECTIONS, SHAPE, STEPS, radiographs, time_functions
 
@@ -62,7 +63,7 @@ def written_out(s, functions):
 
 
 @given(st.integers(0, 10**6), st.floats(0.02, 10.0))
-@settings(deadline=None, max_examples=15)
+@law(15)
 def test_under_white_noise_the_covariance_is_that_of_bayes_rule(seed, deviation):
     """Information adds: C^-1 = H / gamma^2 + P, of functions that share steps, and of one for each step."""
     s, _, equations = steps_seen(seed)
@@ -80,7 +81,7 @@ def test_under_white_noise_the_covariance_is_that_of_bayes_rule(seed, deviation)
 
 
 @given(st.integers(0, 10**6), st.floats(0.02, 10.0))
-@settings(deadline=None, max_examples=15)
+@law(15)
 def test_the_covariance_is_that_of_what_noise_and_the_prior_s_pull_do_to_the_estimate(seed, deviation):
     """The estimate (H + gamma^2 P)^-1 G^T (G a + n) misses a by a linear map of noise n and truth a, written out."""
     s, variance, equations = steps_seen(seed)
@@ -168,7 +169,7 @@ def test_a_section_that_some_rows_see_in_part_is_observed_and_better_known_than_
 
 
 @given(st.integers(0, 10**6), st.sampled_from((3e-4, 3e-3)), st.integers(0, 3))
-@settings(deadline=None, max_examples=15)
+@law(15)
 def test_a_section_is_observed_unless_it_shows_a_thousand_times_less_than_the_others(seed, share, section):
     """S comes from sums in single precision, over rays that other sections move too: that much of it is rounding."""
     equations = random_equations(seed, shape=(4, 2), pixels=200)

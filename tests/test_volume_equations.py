@@ -5,7 +5,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
@@ -14,6 +14,7 @@ from pdvc.prior import Prior
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
 from pdvc.volume import Grid, Hull, Volume, halved
 from pdvc.volume_equations import VolumePair, compare, used_voxels
+from tests.laws import law
 from tests.small_case import SECTIONS, VOXEL_MM, motion, textured, trilinear
 
 SEVEN = replace(SECTIONS, motions=(*RIGID, CONTRACTION))
@@ -107,7 +108,7 @@ def test_beyond_the_known_height_the_last_layer_goes_on_without_a_gradient():
     assert far.equations().matrix[0, 0, 0] == 0
 
 
-@settings(deadline=None, max_examples=15)
+@law(15)
 @given(st.integers(0, 1000), st.sampled_from([0.3, 1.0, 2.0]), st.sampled_from([SECTIONS, SEVEN]))
 def test_a_volume_moved_by_the_same_interpolation_gives_its_motion_back(seed, size, basis):
     reference, amplitude = textured(), motion(basis, seed, size)
@@ -186,7 +187,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
         np.testing.assert_array_equal(one, two)
 
 
-@settings(deadline=None, max_examples=20)
+@law(20)
 @given(st.integers(0, 100), st.floats(-1.5, 0.5), st.floats(0.6, 1.5))
 def test_used_voxels_are_those_whose_centre_is_in_the_hull_and_between_the_heights(seed, low, high):
     rng = np.random.default_rng(seed)
