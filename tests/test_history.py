@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from pdvc.experiment import Series
 from pdvc.history import PAPER, Angle, Force, Fourier, Polynomial, Ramp, Splines, Steps, time_basis
@@ -172,3 +173,41 @@ def test_nothing_but_zero_is_refused():
 def test_no_time_function_at_all_is_refused():
     with pytest.raises(ValueError, match="expected at least one that is not zero over the steps"):
         time_basis((), series(30))
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "least", "most", "functions"),
+    [
+        (Angle, "harmonics", 1, None, 2),
+        (Polynomial, "degree", 0, None, 1),
+        (Fourier, "harmonics", 1, None, 2),
+        (Splines, "intervals", 1, None, 4),
+        (Splines, "degree", 1, 5, 7),
+    ],
+)
+def test_the_least_and_the_most_that_can_be_asked_for_is_made_and_less_or_more_is_refused(
+    kind, key, least, most, functions
+):
+    """A cubic spline has an interval and three more functions; degrees above five are no use to a short test."""
+    assert kind(**{key: least}).functions(series(30)).shape == (functions, 30)
+    with pytest.raises(ValidationError, match=key):
+        kind(**{key: least - 1})
+    if most is not None:
+        assert kind(**{key: most}).functions(series(30)).shape == (functions + most - least, 30)
+        with pytest.raises(ValidationError, match=key):
+            kind(**{key: most + 1})
+
+
+def test_a_power_of_zero_is_a_jump_at_the_start_and_a_negative_one_is_refused():
+    (jump,) = Ramp(start=5, powers=(0,)).functions(series(9))
+    np.testing.assert_array_equal(jump, np.arange(9) > 5)
+    with pytest.raises(ValidationError, match="powers"):
+        Ramp(start=5, powers=(-1,))
+
+
+def test_by_default_the_parts_are_those_of_table_1_and_the_period_is_the_paper_s_test():
+    assert (Force(), Angle(), Polynomial(), Ramp()) == PAPER
+    assert Fourier().functions(series()).shape == (6, 127)
+    np.testing.assert_allclose(Fourier(harmonics=1).functions(series(128))[:, 127], [0, 1], atol=1e-12)
+    assert Splines().functions(series()).shape == (9, 127)
+    assert Splines().functions(series())[0, 0] == 1
