@@ -47,6 +47,8 @@ _BIG = 1e30
 _NORMALS = Hull.normals()
 _NORMALS32 = np.ascontiguousarray(_NORMALS.T, dtype=np.float32)
 _NOWHERE = np.float32(-1e6)
+_FARTHEST = 2.0
+"""Distances from the axis to the source within which a moved sample is followed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +79,8 @@ def normal_equations(
 
     `rays` (step, 4, 3) in mm as of RayVectors.stacked, for the window that `target` (step, row, column) covers;
     `amplitude` (step, section, motion) in voxels of `voxel_mm`; `weight` (step, row, column), or (1, row, column)
-    for all steps, zero for unused pixels. Raises ValueError for amplitudes that are not finite or of another shape.
+    for all steps, zero for unused pixels. Raises ValueError for amplitudes that are not finite or of another shape,
+    or that take the sample out of the scanner.
     """
     return _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, True)
 
@@ -161,6 +164,7 @@ def _walk(
     patterns = _indexed(basis.patterns(), origin, grid.voxel_mm) * ratio
     place, support = _hull_in_index(volume)
     boxes = np.stack([_moved_box(volume, heights, each) for each in maps])
+    _check_reach(boxes, index_rays, grid.voxel_mm)
     bands = [_band_sections(index_rays[t], target.shape[1:], heights, boxes[t]) for t in range(steps)]
     low = np.stack([lowest for lowest, _ in bands])
     size = max(span for _, span in bands) * basis.shape[1] if with_sensitivities else 0
@@ -244,6 +248,17 @@ def _moved_box(volume: Volume, heights: Floats, maps: Floats) -> Floats:
             ]
         )
     return box
+
+
+def _check_reach(boxes: Floats, rays: Floats, voxel_mm: float) -> None:
+    """Raise ValueError where a motion takes the sample so far that sums in single precision mean nothing."""
+    most = _FARTHEST * float(np.linalg.norm(rays[:, 0], axis=1).max())
+    size = float(np.abs(boxes).max())
+    if not size <= most:
+        raise ValueError(
+            f"motion: expected the sample to stay in the beam, found it {size * voxel_mm:.3g} mm away: the test "
+            "radiographs do not show the scanned sample, or their angles or the scanner's distances are wrong"
+        )
 
 
 def _band_sections(
@@ -561,6 +576,8 @@ def _walk_band(  # type: ignore[no-untyped-def]
             along_x = abs(along[0]) >= abs(along[1])
             value = 0.0
             a, end = _clip_box(box, base, along)
+            # a box that reaches the source goes on behind it, where no band's sections were looked for
+            a = max(a, -reach)
             k_first, k_last = n, -1
             rising = along[2] >= 0
             while a < end:
