@@ -15,30 +15,30 @@ A folder is readable without this software::
 
 from __future__ import annotations
 
-import struct
-import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pdvc.geometry import ConeBeam
 from pdvc.settings import Settings, SettingsError
+from pdvc.stacks import DESCRIPTION, ExperimentError, StackWriter, read_stack
 
-DESCRIPTION = "experiment.toml"
 REFERENCE = "reference/radiographs.tif"
 TEST = "test/radiographs.tif"
 FLATS = "flats.tif"
 DARKS = "darks.tif"
 
-Positive = Annotated[float, Field(gt=0)]
+Length = Annotated[float, Field(gt=0, le=1e9)]
+Shift = Annotated[float, Field(ge=-1e9, le=1e9)]
+Pixels = Annotated[int, Field(ge=1, le=100_000)]
+"""Rows or columns of a detector."""
+Recorded = tuple[Annotated[float, Field(ge=-1e9, le=1e9)], ...]
+"""One number for each radiograph; beyond these limits it is a slip, and powers of it overflow."""
 
 
 def interrupted_stack(scan: int) -> str:
@@ -46,34 +46,33 @@ def interrupted_stack(scan: int) -> str:
     return f"interrupted/{scan:02d}/radiographs.tif"
 
 
-class ExperimentError(ValueError):
-    """Say which file of an experiment folder is wrong, what was expected and what was found."""
-
-
 class GeometryEntry(Settings):
     """The scanner: see `pdvc.geometry` for the frame."""
 
-    source_axis_mm: Positive
+    source_axis_mm: Length
     """distance from the source to the rotation axis, mm"""
-    source_detector_mm: Positive
+    source_detector_mm: Length
     """distance from the source to the detector, mm"""
-    pixel_mm: Positive
+    pixel_mm: Length
     """pitch of the detector pixels as stored, mm"""
-    rows: Annotated[int, Field(ge=1)]
+    rows: Pixels
     """detector rows as stored"""
-    columns: Annotated[int, Field(ge=1)]
+    columns: Pixels
     """detector columns as stored"""
-    column_shift_mm: float = 0.0
+    column_shift_mm: Shift = 0.0
     """detector centre to the right of the source-axis line, mm"""
-    row_shift_mm: float = 0.0
+    row_shift_mm: Shift = 0.0
     """detector centre below the source-axis line, mm"""
-    roll_deg: float = 0.0
+    roll_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """detector turned in its plane, from columns towards rows, degrees"""
 
     @model_validator(mode="after")
     def _detector_behind_axis(self) -> Self:
         if self.source_detector_mm <= self.source_axis_mm:
             raise ValueError(f"source_detector_mm above source_axis_mm = {self.source_axis_mm} mm")
+        least = max(1e-9 * self.source_detector_mm, 1e-9)
+        if self.pixel_mm < least or self.source_axis_mm < least:
+            raise ValueError(f"pixel_mm and source_axis_mm of at least {least:.3g} mm, a billionth of the distances")
         return self
 
     def cone_beam(self) -> ConeBeam:
@@ -85,22 +84,22 @@ class GeometryEntry(Settings):
 class AcquisitionEntry(Settings):
     """How the counts were made. The noise entries may be left out: then the noise is not known."""
 
-    frames: Annotated[int, Field(ge=1)] = 1
+    frames: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """frames averaged into each stored image"""
-    photons_per_count: Positive | None = None
+    photons_per_count: Annotated[float, Field(gt=1e-6, le=1e12)] | None = None
     """detected photons that make one count of one frame"""
-    readout_noise_counts: Annotated[float, Field(ge=0)] | None = None
+    readout_noise_counts: Annotated[float, Field(ge=0, le=65535)] | None = None
     """standard deviation of the readout of one frame, counts"""
 
 
 class StackEntry(Settings):
     """One stack of radiographs: one number for each image."""
 
-    angle_deg: tuple[float, ...]
+    angle_deg: Recorded
     """stage angle, counter-clockwise from above, degrees"""
-    time_s: tuple[float, ...]
+    time_s: Recorded
     """time of the middle of the exposure, s"""
-    force_N: tuple[float, ...]
+    force_N: Recorded
     """axial force on the sample, N"""
 
     @model_validator(mode="after")
@@ -208,7 +207,7 @@ def read_experiment(folder: Path) -> Experiment:
         raise ExperimentError(f"{folder}: expected an experiment folder, found none")
     description = Description.read(folder / DESCRIPTION)
     geometry = description.geometry.cone_beam()
-    acquisition = description.acquisition
+    acquisition, size = description.acquisition, (geometry.rows, geometry.columns)
     return Experiment(
         title=description.title,
         material=description.material,
@@ -218,8 +217,8 @@ def read_experiment(folder: Path) -> Experiment:
         readout_noise_counts=acquisition.readout_noise_counts,
         reference=_series(folder, REFERENCE, description.reference, "reference", geometry),
         test=_series(folder, TEST, description.test, "test", geometry),
-        flats=_stack(folder / FLATS, geometry),
-        darks=_stack(folder / DARKS, geometry),
+        flats=read_stack(folder / FLATS, size),
+        darks=read_stack(folder / DARKS, size),
         interrupted=tuple(
             InterruptedScan(
                 step=entry.step,
@@ -238,87 +237,8 @@ def write_description(folder: Path, description: Description) -> None:
     partial.replace(path)
 
 
-class StackWriter:
-    """Write a stack image by image, under a provisional name until it is complete.
-
-    A writer opened again on the same path and shape goes on where the last one stopped: `done` images
-    are there already. Use as a context manager; the file gets its name only if all images were written.
-    """
-
-    def __init__(self, path: Path, shape: tuple[int, int, int]) -> None:
-        self.path = path
-        self._partial = path.with_name(path.name + ".partial")
-        self._count = path.with_name(path.name + ".count")
-        self._shape = shape
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self.done = self._resume()
-        if self.done < 0:
-            self.done = 0
-            path.unlink(missing_ok=True)
-            self._count.write_text("0")
-            # the whole file is laid out now, so that a full disk is met before the work, not after it
-            with tifffile.TiffWriter(self._partial, bigtiff=_too_large(shape)) as tiff:
-                blank = np.zeros(shape[1:], dtype=np.uint16)
-                tiff.write((blank for _ in range(shape[0])), shape=shape, dtype=np.uint16, photometric="minisblack")
-        self._map: Any = _open_map(self._partial, shape) if self.done < shape[0] else None
-
-    def write(self, index: int, image: NDArray[np.uint16]) -> None:
-        """Store the next image, counts (row, column); images come in order."""
-        if index != self.done or self._map is None:
-            raise ValueError(f"{self.path}: expected image {self.done} next, got {index}")
-        self._map[index] = image
-        self.done += 1
-        if self.done % 16 == 0:
-            self._save()
-
-    def _resume(self) -> int:
-        if self.path.exists() and not self._partial.exists():
-            with tifffile.TiffFile(self.path) as tiff:
-                series = tiff.series[0]
-                complete = series.size == int(np.prod(self._shape)) and series.dtype == np.uint16
-            return self._shape[0] if complete else -1
-        if not (self._partial.exists() and self._count.exists()):
-            return -1
-        try:
-            found = tifffile.memmap(self._partial, mode="r")
-            if found.size != int(np.prod(self._shape)):
-                return -1
-            return min(int(self._count.read_text()), self._shape[0])
-        except (ValueError, OSError, tifffile.TiffFileError):
-            return -1
-
-    def _save(self) -> None:
-        self._map.flush()
-        self._count.write_text(str(self.done))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._map is not None:
-            self._save()
-            self._map = None
-        # a process that was killed between the last image and its name left only the naming to do
-        if self.done == self._shape[0] and self._partial.exists():
-            self._partial.replace(self.path)
-            self._count.unlink()
-
-
-def _open_map(path: Path, shape: tuple[int, int, int]) -> Any:
-    pages = tifffile.memmap(path, mode="r+")
-    assert isinstance(pages, np.memmap)
-    # tifffile drops an axis of length one
-    return np.memmap(path, dtype=pages.dtype, mode="r+", offset=pages.offset, shape=shape)
-
-
-def _too_large(shape: Sequence[int]) -> bool:
-    return int(np.prod(shape)) * 2 > 2**32 - 2**25
-
-
 def _series(folder: Path, name: str, entry: StackEntry, key: str, geometry: ConeBeam) -> Series:
-    counts = _stack(folder / name, geometry)
+    counts = read_stack(folder / name, (geometry.rows, geometry.columns))
     if len(counts) != len(entry.angle_deg):
         raise ExperimentError(
             f"{folder / name}: expected {len(entry.angle_deg)} radiographs, "
@@ -330,51 +250,6 @@ def _series(folder: Path, name: str, entry: StackEntry, key: str, geometry: Cone
         time_s=np.asarray(entry.time_s),
         force_N=np.asarray(entry.force_N),
     )
-
-
-def _stack(path: Path, geometry: ConeBeam) -> NDArray[np.uint16]:
-    counts = _read_tiff(path)
-    if counts.dtype.newbyteorder("=") != np.uint16:  # ImageJ writes big-endian
-        raise ExperimentError(f"{path}: expected uint16 counts, found {counts.dtype}")
-    if counts.ndim == 2:
-        counts = counts[None]
-    if counts.shape[1:] != (geometry.rows, geometry.columns):
-        raise ExperimentError(
-            f"{path}: expected (image, {geometry.rows}, {geometry.columns}) as in {DESCRIPTION}, found {counts.shape}"
-        )
-    return counts
-
-
-def _declared_images(tiff: tifffile.TiffFile) -> int | None:
-    """Return how many images the file's own notes promise, as tifffile and ImageJ write them; None without."""
-    for notes in tiff.shaped_metadata or ():
-        if "shape" in notes:
-            return int(np.prod(notes["shape"][:-2]))
-    images = (tiff.imagej_metadata or {}).get("images")
-    return None if images is None else int(images)
-
-
-def _read_tiff(path: Path) -> NDArray[Any]:
-    if not path.is_file():
-        raise ExperimentError(f"{path}: expected a TIFF stack, found none")
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            if len(tiff.series) != 1:
-                raise ExperimentError(f"{path}: expected one stack of equal images, found {len(tiff.series)} series")
-            series = tiff.series[0]
-            needed = series.dataoffset + series.nbytes if series.dataoffset is not None else 0
-            if path.stat().st_size < needed:
-                raise ExperimentError(f"{path}: truncated: expected {needed} bytes, found {path.stat().st_size}")
-            declared = _declared_images(tiff)
-            if declared is not None and declared != len(tiff.pages) and declared != len(series):
-                raise ExperimentError(f"{path}: truncated: expected {declared} images, found {len(tiff.pages)}")
-            if series.dataoffset is not None:
-                return tifffile.memmap(path, mode="r")
-            return series.asarray()
-    except ExperimentError:
-        raise
-    except (tifffile.TiffFileError, ValueError, OSError, LookupError, struct.error, zlib.error) as error:
-        raise ExperimentError(f"{path}: expected a TIFF stack, cannot read it: {error}") from None
 
 
 __all__ = [

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
+
+LARGEST = 1e15
+"""Size that no number of a record exceeds, whatever its unit: squares and products of such numbers are finite."""
 
 
 class SettingsError(ValueError):
@@ -31,8 +36,14 @@ class Settings(BaseModel):
     def parse(cls, values: dict[str, Any], *, where: str) -> Self:
         """Build the record from plain values; `where` names the source in errors.
 
-        Raises SettingsError with one line for each wrong key.
+        Raises SettingsError, in one line, that names each wrong key, what was expected and what was given.
         """
+        huge = [
+            f"{key}: expected a number of size below {LARGEST:g}, given {_short(number)}"
+            for key, number in _huge(values)
+        ]
+        if huge:
+            raise SettingsError(f"{where}: " + "; ".join(huge))
         try:
             # strict validation takes a list for a tuple only from JSON
             return cls.model_validate_json(json.dumps(values, default=str))
@@ -53,14 +64,36 @@ class Settings(BaseModel):
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file into plain values; raises SettingsError where it is missing or no TOML."""
+    """Read a TOML file, with or without a byte-order mark, into plain values.
+
+    Raises SettingsError where it is missing or no TOML.
+    """
     try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except FileNotFoundError:
         raise SettingsError(f"{path}: expected a TOML file, found none") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except IsADirectoryError:
+        raise SettingsError(f"{path}: expected a TOML file, found a folder") from None
+    except RecursionError:
+        raise SettingsError(f"{path}: not valid TOML: too many brackets within each other") from None
+    # a number of thousands of digits is a plain ValueError
+    except ValueError as error:
         raise SettingsError(f"{path}: not valid TOML: {error}") from None
+
+
+def _huge(values: Any, key: str = "") -> Iterator[tuple[str, float]]:
+    """Yield key and value of all numbers that are finite and too large to compute with."""
+    if isinstance(values, dict):
+        for name, part in values.items():
+            yield from _huge(part, f"{key}.{name}" if key else name)
+    elif isinstance(values, list | tuple):
+        for place, part in enumerate(values):
+            yield from _huge(part, f"{key}.{place}" if key else str(place))
+    # a seed may be any whole number that 64 bits hold
+    elif (isinstance(values, float) and LARGEST <= abs(values) < math.inf) or (
+        isinstance(values, int) and not -(2**63) <= values < 2**63
+    ):
+        yield key, values
 
 
 def _explain(detail: ErrorDetails) -> str:
@@ -69,9 +102,25 @@ def _explain(detail: ErrorDetails) -> str:
         return f"{key}: unknown key"
     if detail["type"] == "missing":
         return f"{key}: missing"
+    context = detail.get("ctx", {})
+    if detail["type"] == "union_tag_invalid":
+        return f"{key}: unknown kind {_short(detail['input']['kind'])}, expected {context['expected_tags']}"
+    if detail["type"] == "union_tag_not_found":
+        return f"{key}: kind: missing"
     expected = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    given = repr(detail["input"])
-    return f"{key}: expected {expected}, given {given if len(given) < 80 else given[:77] + '...'}"
+    if isinstance(detail["input"], dict) and detail["type"] == "value_error":
+        # of several keys together: the message tells which, and what they are
+        return f"{key}: expected {expected}"
+    return f"{key}: expected {expected}, given {_short(detail['input'])}"
+
+
+def _short(value: object) -> str:
+    """Return a value as it fits into a line of text."""
+    if isinstance(value, dict):
+        return f"a table of {len(value)} keys"
+    # whole numbers of thousands of digits have no text
+    text = f"a number of {value.bit_length()} bits" if isinstance(value, int) and abs(value) >= 2**64 else repr(value)
+    return text if len(text) < 80 else text[:77] + "..."
 
 
 def _fill(table: Any, record: Settings) -> None:
