@@ -27,6 +27,7 @@ from pydantic import Field, model_validator
 from pdvc.geometry import ConeBeam
 from pdvc.settings import Settings, SettingsError
 from pdvc.stacks import DESCRIPTION, ExperimentError, StackWriter, read_stack
+from pdvc.whole import write_whole
 
 REFERENCE = "reference/radiographs.tif"
 TEST = "test/radiographs.tif"
@@ -231,10 +232,7 @@ def read_experiment(folder: Path) -> Experiment:
 
 def write_description(folder: Path, description: Description) -> None:
     """Write `experiment.toml`, which declares the folder complete: call it last."""
-    path = folder / DESCRIPTION
-    partial = path.with_suffix(".toml.partial")
-    partial.write_text(description.template(), encoding="utf-8")
-    partial.replace(path)
+    write_whole(folder / DESCRIPTION, description.template().encode())
 
 
 def _series(folder: Path, name: str, entry: StackEntry, key: str, geometry: ConeBeam) -> Series:

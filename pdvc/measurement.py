@@ -10,6 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from pdvc.sections import SectionBasis
+from pdvc.whole import read_netcdf, write_netcdf
 
 Floats = NDArray[np.float64]
 _COVARIANCE_AXES = ("function", "coefficient", "coefficient_")
@@ -251,10 +252,7 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
     if m.std_by_source:
         data = data.assign_coords(source=list(m.std_by_source))
         data["std_by_source"] = (("source", "direction"), np.array(list(m.std_by_source.values())), {"units": "voxel"})
-    partial = path.with_name(path.name + ".partial")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    data.to_netcdf(partial, engine="h5netcdf", encoding=packed)
-    partial.replace(path)
+    write_netcdf(path, data, packed)
 
 
 def _axis_std(m: Measurement) -> Floats:
@@ -283,11 +281,11 @@ def read_measurement(path: Path) -> Measurement:
     if not path.is_file():
         raise MeasurementError(f"{path}: expected a measurement file, found none")
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as data:
-            if data.attrs.get("format") != FORMAT:
-                raise ValueError(f"found format {data.attrs.get('format')}")
-            return _unpack(data.load())
-    except (OSError, KeyError, ValueError) as error:
+        data = read_netcdf(path)
+        if data.attrs.get("format") != FORMAT:
+            raise ValueError(f"found format {data.attrs.get('format')}")
+        return _unpack(data)
+    except (KeyError, ValueError, TypeError, IndexError) as error:
         raise MeasurementError(f"{path}: expected a measurement of format {FORMAT}: {error}") from None
 
 

@@ -38,9 +38,23 @@ class Prior:
 def solved(matrix: Floats, right: Floats) -> Floats:
     """Solve a symmetric system, made positive definite by a prior, for a vector or for columns.
 
-    It is scaled to a unit diagonal first, as sections that hardly show have tiny entries.
+    It is scaled to a unit diagonal first, as sections that hardly show have tiny entries. Raises ValueError where it
+    is not positive definite, or not finite: then radiographs and volume have nothing to do with each other.
     """
     scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    factor = linalg.cho_factor(matrix * scale[:, None] * scale, lower=True, overwrite_a=True, check_finite=False)
     sides = scale if right.ndim == 1 else scale[:, None]
-    return np.asarray(linalg.cho_solve(factor, right * sides, check_finite=False) * sides)
+    try:
+        factor = linalg.cho_factor(matrix * scale[:, None] * scale, lower=True, overwrite_a=True, check_finite=False)
+    except linalg.LinAlgError:
+        raise _unsolvable(len(matrix), "they are not positive definite") from None
+    solution = np.asarray(linalg.cho_solve(factor, right * sides, check_finite=False) * sides)
+    if not np.isfinite(solution).all():
+        raise _unsolvable(len(matrix), "their solution is not finite")
+    return solution
+
+
+def _unsolvable(unknowns: int, why: str) -> ValueError:
+    return ValueError(
+        f"equations of {unknowns} unknowns: cannot be solved for a motion, {why}: expected radiographs and a "
+        "reference scan of the same sample"
+    )

@@ -22,6 +22,8 @@ from pdvc.experiment import Experiment
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+LEAST_CONTRAST = 1e-7
+"""Grey levels: the smallest standard deviation that an SNR is taken of."""
 IDENTITY = (1.0, 0.0, 0.0)
 """The polynomial that leaves attenuation as it is."""
 
@@ -172,5 +174,9 @@ def binned(image: Image, factor: int) -> Image:
 
 
 def snr_db(signal: Image, residual: Image, used: NDArray[np.bool_]) -> float:
-    """Return 20 log10(std(signal) / std(residual)) over the used pixels, dB."""
-    return float(20 * np.log10(np.std(signal[used], dtype=float) / np.std(residual[used], dtype=float)))
+    """Return 20 log10(std(signal) / std(residual)) over the used pixels, dB.
+
+    Neither counts as less than what single precision rounds away, so that images without any contrast have one too.
+    """
+    contrast, left = (max(float(np.std(image[used], dtype=float)), LEAST_CONTRAST) for image in (signal, residual))
+    return float(20 * np.log10(contrast / left))

@@ -8,9 +8,9 @@ and a run that was interrupted goes on where it stopped.
 
 from __future__ import annotations
 
-import errno
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from pdvc.experiment import (
     interrupted_stack,
     write_description,
 )
+from pdvc.lock import FULL_DISK, held
 from pdvc.progress import Progress, silent
 from simulator.clean import clean_stack
 from simulator.detector import DetectorMaps, expose_dark, expose_flat
@@ -72,23 +73,27 @@ def simulate(
     `workers` radiographs are computed side by side, by default as many as there are processors. `clean` is a folder
     in which noise-free radiographs are kept, and found again by other scenarios that differ in nothing but noise
     (`simulator.clean`); counts do not depend on it.
-    Raises SimulationError where the folder holds something else or the disk is full.
+    Raises SimulationError where the folder holds something else, InUseError where another process is at work in it,
+    and OSError where it cannot be written; a full disk is answered with the room that is needed.
     """
     check_folder(scenario, folder)
     if all((folder / name).is_file() for name in (DESCRIPTION, DISPLACEMENT, FLATS, DARKS, *_stacks(scenario))):
         return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with held(folder), _full_disk_explained(scenario, folder):
         (folder / DESCRIPTION).unlink(missing_ok=True)
         write_scenario(folder, scenario)
         _write_all(scenario, folder, progress, workers or os.cpu_count() or 1, clean)
+
+
+@contextmanager
+def _full_disk_explained(scenario: Scenario, folder: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
-        if error.errno != errno.ENOSPC:
+        if error.errno not in FULL_DISK:
             raise
-        raise SimulationError(
-            f"{folder}: disk full: {scenario.name} needs {_size_mb(scenario):.0f} MB; free some space and run the "
-            "same command again, it goes on where it stopped"
-        ) from None
+        reason = f"disk full: {scenario.name} needs {_size_mb(scenario):.0f} MB"
+        raise OSError(error.errno, reason, str(folder)) from None
 
 
 def check_folder(scenario: Scenario, folder: Path) -> None:

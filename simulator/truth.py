@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pdvc.settings import SettingsError
+from pdvc.whole import read_netcdf, write_netcdf, write_whole
 from simulator.scenario import Course, Scenario
 from simulator.specimen import section_mm, turn
 
@@ -63,17 +64,11 @@ def truth_points(scenario: Scenario, level_mm: Floats) -> Floats:
 
 def write_scenario(folder: Path, scenario: Scenario) -> None:
     """Write the resolved scenario, whole or not at all."""
-    path = folder / SCENARIO
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".toml.partial")
-    partial.write_text(scenario.template(), encoding="utf-8")
-    partial.replace(path)
+    write_whole(folder / SCENARIO, scenario.template().encode())
 
 
 def write_truth(folder: Path, truth: Truth) -> None:
     """Write the displacement samples, whole or not at all."""
-    path = folder / DISPLACEMENT
-    path.parent.mkdir(parents=True, exist_ok=True)
     dataset = xr.Dataset(
         {
             "point_mm": (("point", "component"), truth.point_mm, {"units": "mm"}),
@@ -86,9 +81,7 @@ def write_truth(folder: Path, truth: Truth) -> None:
         },
         attrs={"format": FORMAT, "points_per_level": POINTS_PER_LEVEL},
     )
-    partial = path.with_suffix(".nc.partial")
-    dataset.to_netcdf(partial, engine="h5netcdf")
-    partial.replace(path)
+    write_netcdf(folder / DISPLACEMENT, dataset)
 
 
 def read_truth(folder: Path) -> Truth:
@@ -98,9 +91,9 @@ def read_truth(folder: Path) -> Truth:
         raise SettingsError(f"{path}: expected the truth of a simulated experiment, found none")
     names = ("level_mm", "point_mm", "displacement_mm", "force_N")
     try:
-        with xr.open_dataset(path, engine="h5netcdf") as dataset:
-            return Truth(**{name: dataset[name].to_numpy() for name in names})
-    except (OSError, KeyError, ValueError) as error:
+        dataset = read_netcdf(path)
+        return Truth(**{name: dataset[name].to_numpy() for name in names})
+    except (KeyError, ValueError) as error:
         raise SettingsError(f"{path}: expected displacement samples, cannot read them: {error}") from None
 
 

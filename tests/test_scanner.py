@@ -115,8 +115,9 @@ def test_a_full_disk_is_told_in_one_line_and_leaves_nothing_that_looks_whole(tmp
             super().write(index, image)
 
     monkeypatch.setattr(scanner, "StackWriter", FullDisk)
-    with pytest.raises(SimulationError, match=r"disk full: tiny needs \d+ MB") as caught:
+    with pytest.raises(OSError, match=r"disk full: tiny needs \d+ MB") as caught:
         simulate(tinier(), tmp_path)
+    assert caught.value.errno == errno.ENOSPC
     assert "\n" not in str(caught.value)
     assert not (tmp_path / DESCRIPTION).exists()
     assert not (tmp_path / REFERENCE).exists()

@@ -156,19 +156,13 @@ def measure(
     Example:  `pdvc-bench measure out/quick/experiment -o motion.nc`
     """
     with _answering() as progress:
-        import shutil
-
         from pdvc.experiment import read_experiment
-        from pdvc.measure import measure as recover
-        from pdvc.measurement import write_measurement
+        from validation.measuring import measure_into
 
         chosen = _read_options(options)
         opened = read_experiment(experiment)
         _use_threads(threads)
-        kept = work or out.with_name(out.name + ".work")
-        write_measurement(recover(opened, chosen, progress=progress, work=kept), out)
-        if work is None:
-            shutil.rmtree(kept, ignore_errors=True)
+        measure_into(out, opened, chosen, work=work, progress=progress)
     _tell(f"measurement: {out}")
 
 
@@ -363,6 +357,7 @@ def study(
     Example:  `pdvc-bench study noise -o out/noise`
     """
     with _answering(resume="give the same command again to go on from here") as progress:
+        from pdvc.lock import held
         from validation.runs import run_trials
         from validation.study import Study, study_file, trials_of
         from validation.study_report import machine, write_study_report
@@ -372,10 +367,11 @@ def study(
         trials = trials_of(chosen, path)
         if scheduler is not None and workers is not None:
             raise ValueError("--workers: expected without --scheduler, which has its own workers")
-        table = run_trials(trials, out, scheduler=scheduler, workers=workers, progress=progress)
-        page, summary = write_study_report(
-            out, chosen, path.read_text(encoding="utf-8"), table, where=machine(scheduler, workers)
-        )
+        with held(out):
+            table = run_trials(trials, out, scheduler=scheduler, workers=workers, progress=progress)
+            page, summary = write_study_report(
+                out, chosen, path.read_text(encoding="utf-8"), table, where=machine(scheduler, workers)
+            )
     from rich.console import Console
 
     from validation.console import study_summary

@@ -25,6 +25,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from pdvc.experiment import Experiment
+from pdvc.lock import held
 from pdvc.measurement import Measurement
 from pdvc.progress import Progress, silent
 from pdvc.settings import SettingsError
@@ -223,13 +224,14 @@ def compare(
     A method that fails is a row with its reason. `scheduler` and `workers` as in `validation.runs.run_trials`.
     """
     runs = comparison.runs()
-    run_trials(runs, folder, scheduler=scheduler, workers=workers, progress=progress)
-    rows: Sequence[Mapping[str, Scalar]] = collected(runs, folder).to_pylist()
-    return write_comparison(
-        folder,
-        comparison.scenarios,
-        comparison.methods,
-        summarised(rows, folder),
-        comparison.notes(),
-        machine(scheduler, workers),
-    )
+    with held(folder):
+        run_trials(runs, folder, scheduler=scheduler, workers=workers, progress=progress)
+        rows: Sequence[Mapping[str, Scalar]] = collected(runs, folder).to_pylist()
+        return write_comparison(
+            folder,
+            comparison.scenarios,
+            comparison.methods,
+            summarised(rows, folder),
+            comparison.notes(),
+            machine(scheduler, workers),
+        )

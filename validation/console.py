@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import time
 from collections.abc import Iterable, Iterator
@@ -24,6 +23,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from pdvc.lock import FULL_DISK
 from validation.scores import Scores
 
 if TYPE_CHECKING:
@@ -92,17 +92,18 @@ class ProgressBars:
 def one_line_errors(console: Console, *, resume: str, debug: bool = False) -> Iterator[None]:
     """Turn what a user can mend into one line on stderr and an exit code; `debug` shows where it came from.
 
-    2: wrong input; 1: the machine failed (no space, no permission, no memory); 130: interrupted.
+    2: wrong input; 1: the machine failed (no space, no permission, no memory), or another process is at work in the
+    folder; 130: interrupted. An error's notes are added.
     """
     try:
         yield
-    except KeyboardInterrupt:
-        _say(console, f"interrupted; {resume}")
+    except KeyboardInterrupt as error:
+        _say(console, "; ".join(["interrupted", *_notes(error), *([] if _notes(error) else [resume])]))
         raise typer.Exit(INTERRUPTED) from None
     except (ValueError, MemoryError, OSError) as error:
         if debug:
             raise
-        _say(console, f"error: {_explain(error)}")
+        _say(console, "; ".join([f"error: {_explain(error)}", *_notes(error)]))
         raise typer.Exit(WRONG_INPUT if isinstance(error, ValueError) else FAILED) from None
 
 
@@ -111,11 +112,15 @@ def _explain(error: Exception) -> str:
         return f"not enough memory: {error}"
     if isinstance(error, OSError):
         name = f"{error.filename}: " if error.filename else ""
-        advice = "; make room, then run the same command again" if error.errno == errno.ENOSPC else ""
+        advice = "; make room, then run the same command again" if error.errno in FULL_DISK else ""
         return f"{name}{error.strerror or error}{advice}"
     # a plain ValueError may be a fault of this program: then its place is wanted
     hint = " (pdvc-bench --debug COMMAND shows where)" if type(error) is ValueError else ""
     return " ".join(str(error).split()) + hint
+
+
+def _notes(error: BaseException) -> list[str]:
+    return getattr(error, "__notes__", [])
 
 
 def _say(console: Console, text: str) -> None:

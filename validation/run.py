@@ -15,15 +15,17 @@ import math
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pdvc.experiment import DESCRIPTION, Experiment, read_experiment
-from pdvc.measurement import Measurement, read_measurement, write_measurement
+from pdvc.lock import held
+from pdvc.measurement import Measurement, MeasurementError, read_measurement, write_measurement
 from pdvc.progress import Progress, silent
+from pdvc.whole import write_whole
 from validation.report import write_report
 from validation.scores import Scores, score
 
@@ -79,10 +81,7 @@ class State:
 
     def write(self, path: Path) -> None:
         """Write the state, whole or not at all."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        partial.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
-        partial.replace(path)
+        write_text(path, json.dumps(asdict(self), indent=2) + "\n")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +97,14 @@ class Outcome:
 def run(job: Job, *, progress: Progress = silent) -> Outcome:
     """Do what is still to be done of a job; called again after an interruption, it goes on there.
 
-    Raises SimulationError where the folder holds another scenario's experiment.
+    Raises SimulationError where the folder holds another scenario's experiment, InUseError where another process is
+    at work in it.
     """
+    with held(job.folder):
+        return _run(job, progress)
+
+
+def _run(job: Job, progress: Progress) -> Outcome:
     from simulator.truth import read_truth
 
     state_path = job.work / "state.json"
@@ -146,7 +151,9 @@ def _measure(
     """Measure unless that is done with the same options; returns the measurement and whether it was."""
     wanted = fingerprint(version("pdvc-bench"), job.options.template(), *_file_stamps(job.experiment))
     if job.measurement.exists() and state.measurement == wanted:
-        return read_measurement(job.measurement), True
+        # one that was damaged since is made again
+        with suppress(MeasurementError):
+            return read_measurement(job.measurement), True
     from pdvc.measure import measure
 
     with _noting("measure", state, state_path):
@@ -187,10 +194,7 @@ def _file_stamps(folder: Path) -> list[str]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    write_whole(path, text.encode())
 
 
 def peak_memory_gib() -> float:
