@@ -10,10 +10,14 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def write_whole(path: Path, content: bytes | memoryview) -> None:
-    """Write a file, and its folder where there is none; raises OSError and leaves what was there where that fails."""
+def write_whole(path: Path, content: bytes | memoryview, *, partial: Path | None = None) -> None:
+    """Write a file, and its folder where there is none; raises OSError and leaves what was there where that fails.
+
+    `partial` is its name meanwhile, by default NAME.partial; where several processes may write it at once, each needs
+    another.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
+    partial = partial or path.with_name(path.name + ".partial")
     try:
         partial.write_bytes(content)
         partial.replace(path)

@@ -44,7 +44,8 @@ def clean_stack(
     It is computed, `workers` images side by side, and kept where the folder does not hold it.
     """
     path = folder / clean_file(scenario, stack)
-    if not path.exists():
+    kept = _kept(path)
+    if kept is None:
         folder.mkdir(parents=True, exist_ok=True)
         # another process may be at the same stack: each writes its own file, and either may name it
         partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
@@ -53,21 +54,33 @@ def clean_stack(
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
-    kept: NDArray[np.float32] = np.load(path, mmap_mode="r")
+        kept = _kept(path)
+    assert kept is not None, f"{path} was written"
+    return kept
+
+
+def _kept(path: Path) -> NDArray[np.float32] | None:
+    """Return a stack that is kept; None where it is not, or is damaged."""
+    try:
+        kept: NDArray[np.float32] = np.load(path, mmap_mode="r")
+    except (OSError, ValueError, EOFError):
+        return None
     return kept
 
 
 def _compute(scenario: Scenario, stack: Stack, path: Path, progress: Progress, workers: int) -> None:
     count = image_count(scenario, stack)
     shape = count, scenario.geometry.rows, scenario.geometry.columns
-    images = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
     make = clear_images(prepare(scenario, course_of(scenario)), stack)
     task = f"{stack} without noise"
     progress(task, 0, count)
-    for index, image in in_order(make, range(count), workers):
-        images[index] = image
-        progress(task, index + 1, count)
-    images.flush()
+    # written, not mapped: a memory map ends the process where the disk is full
+    with path.open("wb") as file:
+        kind = np.lib.format.dtype_to_descr(np.dtype(np.float32))
+        np.lib.format.write_array_header_1_0(file, {"descr": kind, "fortran_order": False, "shape": shape})
+        for index, image in in_order(make, range(count), workers):
+            file.write(np.ascontiguousarray(image, dtype=np.float32).tobytes())
+            progress(task, index + 1, count)
 
 
 def _depends_on(scenario: Scenario, stack: Stack) -> dict[str, Any]:

@@ -154,10 +154,13 @@ def _inverse(
 
 def kept_bound(scenario: Scenario, options: MeasureOptions, path: Path, clean: Path) -> Quantities:
     """Return the bound's quantities, computed and kept as JSON in a file unless they are there."""
-    if not path.exists():
+    try:
+        return Quantities(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):  # not there, or damaged
         found, truth = bound_of(scenario, options, clean)
+        quantities = found.quantities(truth)
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
-        partial.write_text(json.dumps(asdict(found.quantities(truth))), encoding="utf-8")
+        partial.write_text(json.dumps(asdict(quantities)), encoding="utf-8")
         partial.replace(path)
-    return Quantities(**json.loads(path.read_text(encoding="utf-8")))
+        return quantities

@@ -17,6 +17,7 @@ those that failed are.
 
 from __future__ import annotations
 
+import errno
 import io
 import logging
 import math
@@ -26,6 +27,8 @@ import threading
 import time
 import traceback
 import uuid
+import zipfile
+import zlib
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -40,7 +43,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import parquet
 
+from pdvc.lock import FULL_DISK, held
 from pdvc.progress import Progress, silent
+from pdvc.whole import write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -115,8 +120,16 @@ def run_trials(
 
     Runs go to the Dask scheduler at an address, whose workers see the folder under the same path, or else to `workers`
     local processes, by default one for each processor. The table depends on neither, but for columns whose name
-    begins with ``seconds``. Raises ValueError where the scheduler does not answer.
+    begins with ``seconds``. Raises ValueError where the scheduler does not answer, InUseError where another process is
+    at work in the folder, and OSError where it cannot be written: then nothing is lost that was finished.
     """
+    with held(folder):
+        return _run_trials(trials, folder, scheduler, workers, progress)
+
+
+def _run_trials(
+    trials: Sequence[Run], folder: Path, scheduler: str | None, workers: int | None, progress: Progress
+) -> pd.DataFrame:
     shared = (folder / WORK).resolve()
     waiting = {run.key: run for run in trials if not is_done(folder, run)}
     total = len({run.key for run in trials})
@@ -125,20 +138,27 @@ def run_trials(
             (folder / name).mkdir(parents=True, exist_ok=True)
         for left in shared.glob("experiment-*"):  # by runs that were killed
             shutil.rmtree(left, ignore_errors=True)
+        if scheduler is None:  # no worker of a killed command outlives it here; on a cluster one may still be writing
+            for left in (path for name in (RUNS, ERRORS, FAILED) for path in (folder / name).glob(".*.partial")):
+                left.unlink(missing_ok=True)
         with connected(scheduler, workers, shared) as client:
             _Session(client, folder.resolve(), shared, total, progress).carry_out(list(waiting.values()))
     shutil.rmtree(shared, ignore_errors=True)
     table = collected(trials, folder)
-    partial = folder / f"{TABLE}.partial"
-    parquet.write_table(table, partial)
-    partial.replace(folder / TABLE)
+    buffer = io.BytesIO()
+    parquet.write_table(table, buffer)
+    write_whole(folder / TABLE, buffer.getvalue())
     return table.to_pandas()
 
 
 def is_done(folder: Path, run: Run) -> bool:
-    """Return whether a folder holds the row of a run that did not fail."""
-    path = folder / RUNS / f"{run.key}.parquet"
-    return path.exists() and parquet.read_table(path, columns=["status"])["status"][0].as_py() == "done"
+    """Return whether a folder holds row and arrays, undamaged, of a run that did not fail."""
+    try:
+        row = parquet.read_table(folder / RUNS / f"{run.key}.parquet")
+        with zipfile.ZipFile(folder / ERRORS / f"{run.key}.npz") as arrays:
+            return row["status"][0].as_py() == "done" and arrays.testzip() is None
+    except (OSError, ValueError, LookupError, zipfile.BadZipFile, zlib.error):
+        return False
 
 
 def collected(trials: Sequence[Run], folder: Path) -> pa.Table:
@@ -273,6 +293,8 @@ class _Session:
         except CancelledError:
             raise OSError(f"the scheduler gave up run {run.key}: it was restarted, or its cluster closed") from None
         except Exception as error:
+            if _of_the_machine(error):
+                raise
             done = is_done(self._folder, run)
             if not done:
                 trace = "".join(traceback.format_exception(error))
@@ -321,16 +343,22 @@ def _carry_out(run: Run, folder: Path, shared: Path, parts: list[None]) -> bool:
         with _ONE_AT_A_TIME:
             result = run.carry_out(shared)
     except Exception as error:  # whatever it is, it is this row's reason
+        if _of_the_machine(error):
+            raise
         _write_failure(run, folder, error, traceback.format_exc(), time.perf_counter() - started)
         return False
-    if result.arrays:
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **result.arrays)
-        _write_whole(folder / ERRORS / f"{run.key}.npz", buffer.getvalue())
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **result.arrays)
+    _write_whole(folder / ERRORS / f"{run.key}.npz", buffer.getvalue())
     values = {"status": "done", "reason": "", **result.scores, "seconds": time.perf_counter() - started}
     _write_row(run, folder, values)
     (folder / FAILED / f"{run.key}.log").unlink(missing_ok=True)
     return True
+
+
+def _of_the_machine(error: Exception) -> bool:
+    """Return whether every other run would fail of the same: then none of them is given a row."""
+    return isinstance(error, OSError) and error.errno in FULL_DISK | {errno.EROFS, errno.EIO}
 
 
 def _write_failure(run: Run, folder: Path, error: Exception, trace: str, seconds: float) -> None:
@@ -356,9 +384,7 @@ def _row(run: Run, values: Mapping[str, Scalar]) -> pa.Table:
 
 def _write_whole(path: Path, content: bytes) -> None:
     # a name that begins with a dot is no part of the table that the folder is
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_bytes(content)
-    partial.replace(path)
+    write_whole(path, content, partial=path.with_name(f".{path.name}.{os.getpid()}.partial"))
 
 
 def _remove(path: Path) -> None:
