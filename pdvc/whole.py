@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,7 +33,14 @@ def write_netcdf(path: Path, data: xr.Dataset, encoding: Mapping[Hashable, dict[
 
     It is packed in memory first: HDF5 cannot recover from a disk that is full.
     """
-    write_whole(path, data.to_netcdf(None, engine="h5netcdf", encoding=encoding))
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as file:
+        # not by to_netcdf, which in a worker asks the cluster for a lock on the buffer
+        data.dump_to_store(H5NetCDFStore(file), encoding=encoding)
+    write_whole(path, buffer.getbuffer())
 
 
 def read_netcdf(path: Path) -> xr.Dataset:
