@@ -1,11 +1,11 @@
 """Commands killed at random moments and given again: python -m benchmarks.faults [moments] [name ...].
 
-`run quick`, a study of six runs and a comparison of two methods are carried out undisturbed. Then, for each moment,
-in a new folder: the command is killed (SIGKILL), and the same command given again, to the end. Its scores have to be
-those of the undisturbed one to the last digit, but for times and memory, with no run twice and nothing half-written
-left. The moments are spread over the time that the undisturbed command takes, one at random in each part of equal
-length. Every other time the command's whole group of processes is killed; in between the command alone, whose workers
-are left to themselves, and the same command is given at once.
+`run quick`, a study of six runs and a comparison of two methods are carried out undisturbed. Then they are killed
+(SIGKILL) and the same command is given again, three times in a row in each folder, and then to the end. Its scores
+have to be those of the undisturbed one to the last digit, but for times and memory, with no run twice and nothing
+half-written left. The moments are spread over the time that the undisturbed command takes, one at random in each part
+of equal length. Every other time the command's whole group of processes is killed; in between the command alone, whose
+workers are left to themselves, and the same command is given at once.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ import psutil
 from validation.study_report import machine
 
 MOMENTS = 30
+IN_A_ROW = 3
+"""Kills in one folder."""
 SEED = 8
 TIMES = ("seconds", "peak_memory_gib")
 """Scores that no two runs share."""
@@ -142,7 +144,9 @@ class Tally:
     seconds: float
     """Of the undisturbed command, s."""
     killed: int = 0
+    folders: int = 0
     same: int = 0
+    """Folders in which all was as in the undisturbed one."""
     ended: int = 0
     """Times that the command had ended before its moment came."""
     wrong: list[str] = field(default_factory=list)
@@ -152,26 +156,42 @@ class Tally:
     """Longest time that a worker outlived its command, s."""
 
 
-def disturb(job: Job, folder: Path, moments: int, rng: np.random.Generator) -> Tally:
-    """Kill a job at so many moments, each time in a new folder, and compare what it finds when given again."""
+def disturb(job: Job, folder: Path, moments: int, rng: np.random.Generator, in_a_row: int = IN_A_ROW) -> Tally:
+    """Kill a job at so many moments, some in a row in each folder, and compare what it finds when given again."""
     seconds = job.finish(folder / "undisturbed")
-    expected, tally = job.found(folder / "undisturbed"), Tally(job=job.name, seconds=seconds)
-    for n, share in enumerate((np.arange(moments) + rng.random(moments)) / moments):
-        out = folder / f"{n:02d}"
-        leader = kill(job, out, float(share) * seconds, alone=n % 2 == 1)
-        if leader is None:
-            tally.ended += 1
-        else:
+    expected, tally, begun = job.found(folder / "undisturbed"), Tally(job=job.name, seconds=seconds), to_begin_s()
+    places = (np.arange(moments) + rng.random(moments)) / moments * seconds
+    # the first folder gets the first, the eleventh and the twenty-first of thirty, and so on
+    folders = -(-moments // in_a_row)
+    for n in range(folders):
+        out, before = folder / f"{n:02d}", 0.0
+        leaders: list[int] = []
+        for k, place in enumerate(places[n::folders]):
+            leader = kill(job, out, float(place) - before + (begun if k else 0), alone=(n + k) % 2 == 1)
+            before = float(place)
+            if leader is None:
+                tally.ended += 1
+                continue
+            leaders.append(leader)
             tally.killed += 1
-            tally.after[told(out).partition(":")[0]] += 1
-            if n % 2:
+            tally.after[told(out).partition(":")[0].partition(",")[0]] += 1
+            if (n + k) % 2:
                 tally.orphans_s = max(tally.orphans_s, outlived(leader))
-        tally.wrong += [f"{n}: {reason}" for reason in compared(job, out, expected)]
-        if leader is not None and group(leader):
-            tally.wrong.append(f"{n}: processes of the killed command are still there")
-        tally.same += not any(each.startswith(f"{n}: ") for each in tally.wrong)
-        print(f"{job.name}: moment {n + 1} of {moments}, {tally.same} the same", file=sys.stderr, flush=True)
+        wrong = compared(job, out, expected)
+        if any(group(leader) for leader in leaders):
+            wrong.append("processes of a killed command are still there")
+        tally.folders += 1
+        tally.same += not wrong
+        tally.wrong += [f"folder {n}: {reason}" for reason in wrong]
+        print(f"{job.name}: folder {n + 1} of {folders}, {tally.same} the same", file=sys.stderr, flush=True)
     return tally
+
+
+def to_begin_s() -> float:
+    """Return how long a command takes before it does anything, s."""
+    began = time.perf_counter()
+    subprocess.run([sys.executable, "-c", "import pdvc.measure, validation.run, simulator.scanner"], check=True)
+    return time.perf_counter() - began
 
 
 def outlived(leader: int, most_s: float = 0.5) -> float:
@@ -198,13 +218,13 @@ def show(tally: Tally) -> str:
     """Return a row of the table in docs/faults.md."""
     after = ", ".join(f"{count} {task}" for task, count in tally.after.most_common())
     return (
-        f"| `{tally.job}` | {tally.seconds:.0f} | {tally.killed + tally.ended} | {tally.killed} | {tally.same} "
+        f"| `{tally.job}` | {tally.seconds:.0f} | {tally.killed} | {tally.ended} | {tally.same} of {tally.folders} "
         f"| {tally.orphans_s:.1f} | {after} |"
     )
 
 
 HEAD = (
-    "| command | undisturbed, s | moments | killed | the same | workers alone, s | last told when killed |\n"
+    "| command | undisturbed, s | kills | ended before | folders the same | workers alone, s | told last |\n"
     "| --- | --- | --- | --- | --- | --- | --- |"
 )
 
