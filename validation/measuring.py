@@ -42,7 +42,7 @@ def measure_into(
                 shutil.rmtree(folder, ignore_errors=True)
             raise
         except BaseException as error:
-            if any(folder.glob("*.npz")):
+            if any(path.suffix != ".partial" and not path.name.startswith(".") for path in folder.iterdir()):
                 error.add_note(f"what was found so far is kept in {folder}, and the same command goes on from there")
             elif work is None:
                 shutil.rmtree(folder, ignore_errors=True)
