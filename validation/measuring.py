@@ -6,6 +6,9 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pdvc.lock import held
 from pdvc.measurement import Measurement, write_measurement
 from pdvc.progress import Progress, silent
@@ -27,7 +30,8 @@ def measure_into(
 
     FILE.work is removed at the end, and where the input cannot be used. It stays where an interruption, or a failure
     of the machine, leaves something to go on from; the error's note says so.
-    Raises ValueError for data that cannot be used, InUseError where another process is at the same file.
+    Raises ValueError for data that cannot be used, or whose result is not finite, InUseError where another process is
+    at the same file.
     """
     from pdvc.measure import measure
 
@@ -36,6 +40,7 @@ def measure_into(
     with held(folder):
         try:
             measurement = measure(experiment, options, progress=progress, work=folder)
+            check_finite(measurement)
             write_measurement(measurement, file)
         except ValueError:
             if work is None and new:
@@ -50,3 +55,21 @@ def measure_into(
         if work is None:
             shutil.rmtree(folder, ignore_errors=True)
     return measurement
+
+
+def check_finite(measurement: Measurement) -> None:
+    """Raise ValueError where a number of a measurement is not finite that a reader would take for measured."""
+    seen = measurement.observed
+    numbers: dict[str, NDArray[np.floating]] = {
+        "displacements": measurement.amplitude[:, seen],
+        "standard deviations": measurement.amplitude_std[:, seen],
+        "covariances": measurement.covariance,
+        "residuals": measurement.residual_final,
+        "SNR": np.stack([measurement.snr_initial_db, measurement.snr_rigid_db, measurement.snr_final_db]),
+    }
+    wrong = [name for name, values in numbers.items() if not np.isfinite(values).all()]
+    if wrong:
+        raise ValueError(
+            f"measurement: expected finite numbers, found others among {', '.join(wrong)}: the radiographs cannot be "
+            "measured with these options"
+        )

@@ -26,6 +26,7 @@ from pdvc.lock import held
 from pdvc.measurement import Measurement, MeasurementError, read_measurement, write_measurement
 from pdvc.progress import Progress, silent
 from pdvc.whole import write_whole
+from validation.measuring import check_finite
 from validation.report import write_report
 from validation.scores import Scores, score
 
@@ -158,6 +159,7 @@ def _measure(
 
     with _noting("measure", state, state_path):
         measurement = measure(experiment, job.options, progress=progress, work=job.work / "measure")
+        check_finite(measurement)
         write_measurement(measurement, job.measurement)
         state.measurement = wanted
     return measurement, False

@@ -113,13 +113,13 @@ class Study(Settings):
     """how to measure: default, paper, or a TOML file, relative to this one"""
     change: dict[str, Any] = Field(default_factory=dict)
     """changes of the base for all runs, as scenario.detector.frames = 1"""
-    repetitions: Annotated[int, Field(ge=1)] = 10
+    repetitions: Annotated[int, Field(ge=1, le=100_000)] = 10
     """noise draws of each combination"""
     seed: Annotated[int, Field(ge=0)] = 0
     """of the sample, the detector, all noise and the Latin hypercube"""
     design: Literal["grid", "list", "latin-hypercube"] = "grid"
     """how the values of several factors are combined"""
-    samples: Annotated[int, Field(ge=1)] | None = None
+    samples: Annotated[int, Field(ge=1, le=100_000)] | None = None
     """combinations of a Latin hypercube"""
     factor: tuple[Factor, ...] = ()
     """what varies; without any, the base is repeated"""
@@ -237,8 +237,11 @@ def _changed_base(study: Study, path: Path) -> dict[str, Any]:
     """Return scenario and options as plain values, after the study's changes and its seed."""
     folder = path.parent
     named = PROTOCOLS.get(study.options)
-    scenario = load_scenario(folder / study.scenario if study.scenario.endswith(".toml") else study.scenario)
-    options = named() if named else MeasureOptions.read(folder / study.options)
+    try:
+        scenario = load_scenario(folder / study.scenario if study.scenario.endswith(".toml") else study.scenario)
+        options = named() if named else MeasureOptions.read(folder / study.options)
+    except SettingsError as error:
+        raise SettingsError(f"{path}: {error}") from None
     base = {"scenario": scenario.model_dump(mode="json"), "options": options.model_dump(mode="json")}
     base["scenario"] |= {"seed": study.seed, "repetition": 0}
     _merge(base, study.change, f"{path}: change", ())
