@@ -19,6 +19,7 @@ from pdvc.experiment import (
     read_experiment,
     write_description,
 )
+from pdvc.stacks import read_stack
 from tests.laws import law
 
 ROWS, COLUMNS = 6, 4
@@ -164,6 +165,36 @@ def test_ordinary_tiffs_of_other_programs_are_read(folder, how):
     np.testing.assert_array_equal(read_experiment(folder).test.counts, images)
 
 
+@pytest.mark.filterwarnings("ignore:.*stored as RGB:DeprecationWarning")
+@pytest.mark.parametrize("how", [{}, {"compression": "zlib"}, {"imagej": True}])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
+def test_a_stack_of_few_images_written_in_the_plainest_way_is_read(folder, count, how):
+    """Of three or four images tifffile makes the colours of one."""
+    images = np.random.default_rng(count).integers(0, 65536, (count, ROWS, 7), dtype=np.uint16)
+    tifffile.imwrite(folder / "test.tif", images, **how)
+    np.testing.assert_array_equal(read_stack(folder / "test.tif", (ROWS, 7)), images)
+
+
+@pytest.mark.filterwarnings("ignore:.*stored as RGB:DeprecationWarning")
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_three_images_in_one_page_are_missed_when_cut_off(folder, share):
+    images = np.zeros((3, ROWS, 7), dtype=np.uint16)
+    tifffile.imwrite(folder / "test.tif", images)
+    cut(folder / "test.tif", share)
+    with pytest.raises(ExperimentError, match=r"test\.tif: truncated: expected \d+ bytes"):
+        read_stack(folder / "test.tif", (ROWS, 7))
+
+
+def test_a_header_that_promises_more_than_any_memory_is_refused_before_it_is_read(folder):
+    path = folder / "flats.tif"
+    tifffile.imwrite(path, counts("flats.tif"), photometric="minisblack", compression="zlib")
+    with tifffile.TiffFile(path, mode="r+b") as tiff:
+        for page in tiff.pages:
+            page.tags["ImageLength"].overwrite(2_000_000_000)
+            page.tags["ImageWidth"].overwrite(2_000_000_000)
+    assert f"{path}: " in refused(folder)
+
+
 def test_pages_written_one_by_one_without_metadata_are_one_stack(folder):
     images = counts("test/radiographs.tif")
     with tifffile.TiffWriter(folder / "test/radiographs.tif") as tiff:
@@ -278,8 +309,20 @@ def test_as_many_angles_as_radiographs_are_expected(folder):
         ("source_axis_mm", "source_axes_mm", "geometry.source_axes_mm: unknown key"),
         ("frames = 5", "frames = 'five'", "acquisition.frames: expected a valid integer"),
         ("[geometry]", "[geometry", "not valid TOML"),
+        ("force_N = [250.0, 251.0, 252.0]", "force_N = [250.0, 1e300, 252.0]", "force_N.1: expected a number of size"),
+        (
+            "force_N = [250.0, 251.0, 252.0]",
+            "force_N = [250.0, -1e10, 252.0]",
+            "test.force_N.1: expected greater than",
+        ),
+        ("roll_deg = 1.0", "roll_deg = inf", "geometry.roll_deg: expected a finite number, given inf"),
+        ("roll_deg = 1.0", "roll_deg = 1e6", "geometry.roll_deg: expected less than or equal to 360"),
+        ("column_shift_mm = 0.0", "column_shift_mm = nan", "geometry.column_shift_mm: expected a finite number"),
+        ("readout_noise_counts = 9.0", "readout_noise_counts = -9.0", "readout_noise_counts: expected greater than"),
+        ("photons_per_count = 2.5", "photons_per_count = 0.0", "acquisition.photons_per_count: expected greater"),
+        ("rows = 6", "rows = 1000000000", "geometry.rows: expected less than or equal to 100000"),
+        ("pixel_mm = 0.5", "pixel_mm = 1e-15", "geometry: expected pixel_mm and source_axis_mm of at least 3e-07 mm"),
     ],
-    ids=["NaN force", "negative pitch", "misspelt key", "wrong type", "no TOML"],
 )
 def test_a_wrong_entry_is_named_by_its_key(folder, old, new, message):
     path = folder / "experiment.toml"
@@ -335,6 +378,26 @@ def test_a_stack_whose_writer_was_killed_after_the_last_image_is_finished_by_the
         assert writer.done == 16
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), images)
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
+
+
+def test_a_note_of_progress_that_a_kill_left_beside_a_whole_stack_goes(tmp_path):
+    images = counts("test/radiographs.tif")
+    write_stack(tmp_path / "a.tif", images)
+    (tmp_path / "a.tif.count").write_text("3")
+    write_stack(tmp_path / "a.tif", images)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
+
+
+@pytest.mark.parametrize("left", [0, 5, 300])
+def test_a_whole_stack_that_was_damaged_since_is_begun_anew(tmp_path, left):
+    images = counts("reference/radiographs.tif")
+    write_stack(tmp_path / "a.tif", images)
+    (tmp_path / "a.tif").write_bytes((tmp_path / "a.tif").read_bytes()[:left])
+    with StackWriter(tmp_path / "a.tif", images.shape) as writer:
+        assert writer.done == 0
+        for i, image in enumerate(images):
+            writer.write(i, image)
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), images)
 
 
 def test_a_stack_of_another_shape_is_begun_anew(tmp_path):

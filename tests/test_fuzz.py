@@ -11,6 +11,7 @@ import math
 import os
 import shutil
 import tomllib
+import warnings
 from contextlib import suppress
 
 import numpy as np
@@ -229,8 +230,8 @@ def broken_folder(draw, folder, name="other"):
         elif how == "stack":
             images, kind = draw(stacks())
             stack.unlink()
-            # tifffile refuses some shapes
-            with suppress(ValueError):
+            # tifffile refuses some shapes, and warns of what it will do with others
+            with suppress(ValueError), warnings.catch_warnings(action="ignore", category=DeprecationWarning):
                 tifffile.imwrite(stack, images, **kind)
         elif how == "counts":
             counts = tifffile.imread(folder / "experiment" / stack.relative_to(other)).copy()

@@ -7,6 +7,7 @@ from pdvc.experiment import Description
 from pdvc.history import Angle, Force, Polynomial, Ramp, Splines
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.settings import SettingsError, read_toml
+from simulator.scenario import Scenario
 from tests.laws import law
 from validation.strategies import descriptions
 
@@ -106,6 +107,34 @@ def test_an_unknown_motion_is_named():
 def test_an_unknown_kind_of_time_function_is_named_with_the_known_ones():
     with pytest.raises(SettingsError, match=r"time\.0: .*'wavelet'.*'splines'"):
         MeasureOptions.parse({"time": [{"kind": "wavelet"}]}, where="options")
+
+
+def test_a_time_function_without_kind_is_answered_with_the_key():
+    with pytest.raises(SettingsError, match=r"options: time\.0: kind: missing$"):
+        MeasureOptions.parse({"time": [{"degree": 3}]}, where="options")
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (changed(("reference", "time_s"), [0.0]), "for each radiograph (found 2, 1 and 2)"),
+        (changed(("geometry", "pixel_mm"), {"x": 1, "y": 2}), "a valid number, given a table of 2 keys"),
+        (changed(("test", "force_N"), [{"x": 1}]), "test.force_N.0: expected a valid number, given a table of 1 keys"),
+        (
+            changed(("geometry", "rows"), 10**5000),
+            "expected a number of size below 1e+15, given a number of 16610 bits",
+        ),
+        (changed(("geometry", "pixel_mm"), 1e300), "expected a number of size below 1e+15, given 1e+300"),
+    ],
+)
+def test_what_was_given_is_told_shortly_and_never_as_a_dictionary(values, expected):
+    text = explained(values)
+    assert text.endswith(expected)
+    assert "{" not in text
+
+
+def test_a_seed_may_be_any_number_of_64_bits():
+    assert Scenario.parse({"seed": 2**63 - 1}, where="a.toml").seed == 2**63 - 1
 
 
 def test_text_that_is_no_toml_is_refused_by_file(tmp_path):
