@@ -157,25 +157,32 @@ class Tally:
 
 
 def disturb(job: Job, folder: Path, moments: int, rng: np.random.Generator, in_a_row: int = IN_A_ROW) -> Tally:
-    """Kill a job at so many moments, some in a row in each folder, and compare what it finds when given again."""
+    """Kill a job so many times, some in a row in each folder, and compare what it finds when given again.
+
+    The machine's pace changes: where a command had ended before its moment came, the time that it takes is corrected,
+    and another folder makes up for the moment.
+    """
     seconds = job.finish(folder / "undisturbed")
     expected, tally, begun = job.found(folder / "undisturbed"), Tally(job=job.name, seconds=seconds), to_begin_s()
-    places = (np.arange(moments) + rng.random(moments)) / moments * seconds
+    shares = (np.arange(moments) + rng.random(moments)) / moments
     # the first folder gets the first, the eleventh and the twenty-first of thirty, and so on
-    folders = -(-moments // in_a_row)
-    for n in range(folders):
-        out, before = folder / f"{n:02d}", 0.0
-        leaders: list[int] = []
-        for k, place in enumerate(places[n::folders]):
-            leader = kill(job, out, float(place) - before + (begun if k else 0), alone=(n + k) % 2 == 1)
-            before = float(place)
+    planned = -(-moments // in_a_row)
+    while tally.killed < moments and tally.folders < 4 * planned:
+        n = tally.folders
+        out, before, lived, leaders = folder / f"{n:03d}", 0.0, 0.0, []
+        for k, share in enumerate(shares[n % planned :: planned]):
+            alone, began = (n + k) % 2 == 1, time.perf_counter()
+            leader = kill(job, out, (share - before) * seconds + (begun if k else 0), alone=alone)
+            lived += time.perf_counter() - began
+            before = share
             if leader is None:
                 tally.ended += 1
-                continue
+                seconds = min(seconds, lived)
+                break
             leaders.append(leader)
             tally.killed += 1
-            tally.after[told(out).partition(":")[0].partition(",")[0]] += 1
-            if (n + k) % 2:
+            tally.after[stage(out)] += 1
+            if alone:
                 tally.orphans_s = max(tally.orphans_s, outlived(leader))
         wrong = compared(job, out, expected)
         if any(group(leader) for leader in leaders):
@@ -183,8 +190,15 @@ def disturb(job: Job, folder: Path, moments: int, rng: np.random.Generator, in_a
         tally.folders += 1
         tally.same += not wrong
         tally.wrong += [f"folder {n}: {reason}" for reason in wrong]
-        print(f"{job.name}: folder {n + 1} of {folders}, {tally.same} the same", file=sys.stderr, flush=True)
+        print(f"{job.name}: folder {n + 1}, {tally.killed} kills, {tally.same} the same", file=sys.stderr, flush=True)
     return tally
+
+
+def stage(folder: Path) -> str:
+    """Return how far a killed command had come: the task that it told last, or the runs that it had finished."""
+    if (folder / "runs").is_dir():
+        return f"{len(list((folder / 'runs').glob('*.parquet')))} runs"
+    return told(folder).partition(":")[0].partition(",")[0]
 
 
 def to_begin_s() -> float:
@@ -224,7 +238,7 @@ def show(tally: Tally) -> str:
 
 
 HEAD = (
-    "| command | undisturbed, s | kills | ended before | folders the same | workers alone, s | told last |\n"
+    "| command | undisturbed, s | kills | ended before | folders the same | workers alone, s | done when killed |\n"
     "| --- | --- | --- | --- | --- | --- | --- |"
 )
 

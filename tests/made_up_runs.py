@@ -67,6 +67,9 @@ class Sum:
         note(self.diary, f"began {self.key}")
         if self.fate == "raises":
             raise ValueError("expected another number,\n  got this one")
+        if self.fate.startswith("errno "):
+            number = int(self.fate.removeprefix("errno "))
+            raise OSError(number, os.strerror(number), "/data/full")
         if self.fate == "kills" or (self.fate == "kills once" and not self._killed()):
             os.kill(os.getpid(), signal.SIGKILL)
         self.parts()[0].make(shared)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,6 +51,29 @@ def test_a_stack_is_computed_only_if_it_is_not_there(tmp_path):
     again = clean_stack(tiny(repetition=1), LOADED, tmp_path, progress=idle)
     np.testing.assert_array_equal(first, again)
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("left", [0, 40, 0.5, 0.999])
+def test_a_stack_that_was_cut_short_is_computed_again(tmp_path, left):
+    first = np.array(clean_stack(tiny(), LOADED, tmp_path, workers=1))
+    path = tmp_path / clean_file(tiny(), LOADED)
+    content = path.read_bytes()
+    path.write_bytes(content[: left if isinstance(left, int) else int(left * len(content))])
+    np.testing.assert_array_equal(clean_stack(tiny(), LOADED, tmp_path, workers=1), first)
+    assert path.read_bytes() == content
+
+
+def test_a_full_disk_is_an_error_and_not_the_end_of_the_process(tmp_path):
+    """A file written through a memory map would end it with a signal."""
+    code = (
+        "import resource, pathlib, sys; from tests.test_clean import LOADED, clean_stack, tiny\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))\n"
+        "try: clean_stack(tiny(), LOADED, pathlib.Path(sys.argv[1]), workers=1)\n"
+        "except OSError as error: sys.exit(error.errno)"
+    )
+    found = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False, cwd=Path(__file__).parent.parent)
+    assert found.returncode == errno.EFBIG
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_changes_the_test_alone_shares_the_reference_scan():

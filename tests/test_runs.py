@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections import Counter
 
@@ -139,6 +140,61 @@ def test_an_interrupted_job_goes_on_and_repeats_nothing(tmp_path, address):
     assert told[0] in (("runs", len(done), 30), ("runs", len(done) + 1, 30))
     assert all(diary(tmp_path)[f"began {key}"] == 1 for key in done)
     pd.testing.assert_frame_equal(table[["number", "total"]], expected(trials), check_dtype=False)
+
+
+@pytest.mark.parametrize("damaged", ["runs/g1.parquet", "errors/g1.npz"])
+@pytest.mark.parametrize("left", [None, 0, 0.5, 0.99])
+def test_a_row_or_arrays_that_were_damaged_are_made_again_alone(tmp_path, address, damaged, left):
+    trials = [Sum("g", n, tmp_path) for n in range(3)]
+    table = run_trials(trials, tmp_path / "out", scheduler=address)
+    path = tmp_path / "out" / damaged
+    content = path.read_bytes()
+    path.unlink()
+    if left is not None:
+        path.write_bytes(content[: int(left * len(content))])
+    before = diary(tmp_path)
+    again = run_trials(trials, tmp_path / "out", scheduler=address)
+    assert diary(tmp_path) - before == Counter({"began g1": 1, "made g": 1})
+    pd.testing.assert_frame_equal(again.drop(columns="seconds"), table.drop(columns="seconds"))
+    assert np.load(tmp_path / "out" / "errors" / "g1.npz")["total"] == table["total"][1]
+
+
+def test_arrays_of_which_a_byte_is_wrong_are_made_again(tmp_path, address):
+    trials = [Sum("h", 1, tmp_path)]
+    run_trials(trials, tmp_path / "out", scheduler=address)
+    path = tmp_path / "out" / "errors" / "h1.npz"
+    content = bytearray(path.read_bytes())
+    # the array's one number is the last thing before the archive's list of contents
+    content[content.index(b"PK\x01\x02") - 1] ^= 255
+    path.write_bytes(content)
+    assert not is_done(tmp_path / "out", trials[0])
+    run_trials(trials, tmp_path / "out", scheduler=address)
+    assert is_done(tmp_path / "out", trials[0])
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO])
+def test_a_failure_of_the_machine_ends_the_job_and_gives_no_run_a_row(tmp_path, address, number):
+    trials = [Sum("i", n, tmp_path, f"errno {number}" if n == 1 else "") for n in range(3)]
+    with pytest.raises(OSError, match="/data/full") as caught:
+        run_trials(trials, tmp_path / "out", scheduler=address)
+    assert caught.value.errno == number
+    assert not (tmp_path / "out" / "runs" / "i1.parquet").exists()
+    assert not (tmp_path / "out" / "table.parquet").exists()
+    mended = [Sum("i", n, tmp_path) for n in range(3)]
+    pd.testing.assert_frame_equal(
+        run_trials(mended, tmp_path / "out", scheduler=address)[["number", "total"]],
+        expected(mended),
+        check_dtype=False,
+    )
+
+
+def test_what_killed_workers_had_half_written_is_removed(tmp_path):
+    trials = [Sum("j", 1, tmp_path)]
+    left = tmp_path / "out" / "runs" / ".j1.parquet.123.partial"
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"PAR1")
+    run_trials(trials, tmp_path / "out", workers=1)
+    assert not left.exists()
 
 
 def test_a_row_takes_its_first_columns_from_the_study_that_asks(tmp_path, address):
