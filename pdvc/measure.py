@@ -6,7 +6,6 @@ that an interrupted measurement goes on where it was.
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import time
 from collections.abc import Mapping
@@ -171,7 +170,8 @@ class _Solver:
         """Solve the stages in turn from a start (function, section, motion), voxels; return where they end."""
         for stage in stages:
             kept = self._store.arrays(
-                f"stage {name} {self._options.model_dump()} {stage.model_dump()} {_digest(start)}",
+                "stage",
+                (name, self._options, stage, basis, self._time_functions, start),
                 lambda stage=stage, start=start: _packed(self._solved(name, basis, stage, start)),  # type: ignore[misc]
             )
             self.stages.append(
@@ -238,10 +238,6 @@ def _packed(solution: Solution) -> dict[str, NDArray[Any]]:
         "rms": solution.rms,
         "stop_reason": np.array(solution.stop_reason),
     }
-
-
-def _digest(values: Floats) -> str:
-    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
 
 
 def _scale(stage: StageOptions) -> int:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +34,7 @@ from pdvc.radiographs import (
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import fdk, seen_half_height_mm
 from pdvc.sections import RIGID, SectionBasis
-from pdvc.store import Store
+from pdvc.store import Keep, Store
 from pdvc.systematic import Neighbours, Systematic, neighbouring_views
 from pdvc.volume import Grid, Hull, Volume
 
@@ -46,9 +45,6 @@ _OUTLINE_ROWS = 240
 """The outline is found on radiographs binned to about this many rows."""
 _OUTLINE_VIEWS = 150
 _HULL_MARGIN_VOXEL = 3.0
-
-Keep = Callable[[Callable[[], Mapping[str, NDArray[Any]]]], Mapping[str, NDArray[Any]]]
-"""Store.arrays with its name already given: makes arrays, or finds them kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +74,7 @@ def calibrated(
     calibration = calibrate(experiment)
     given = {"fit": None, "none": IDENTITY}.get(str(options.beam_hardening), options.beam_hardening)
     polynomial = given if isinstance(given, tuple) else None
-    keep = partial(store.arrays, f"outline {options.beam_hardening}", reference_alone=True)
+    keep = partial(store.of_reference, "outline", (calibration, polynomial))
     outline = outlined(experiment.reference, experiment.geometry, calibration, polynomial, keep, progress)
     return calibration.with_polynomial(outline.polynomial), outline
 
@@ -219,8 +215,7 @@ def reference_volume(
     progress: Progress,
 ) -> Volume:
     """Reconstruct the reference scan at a scale; every experiment with the same reference scan finds it kept."""
-    name = f"volume scale {scale} {options.beam_hardening} {options.smooth_px}"
-    keep = partial(store.arrays, name, reference_alone=True)
+    keep = partial(store.of_reference, "volume", (calibration, hull, scale, options.smooth_px))
     series, geometry = experiment.reference, experiment.geometry
     return scan_volume(series, geometry, calibration, hull, scale, options.smooth_px, keep, progress)
 

@@ -1,8 +1,14 @@
-"""Intermediate results kept in a work folder, so that an interrupted measurement goes on where it was."""
+"""Intermediate results kept in a work folder, so that an interrupted measurement goes on where it was.
+
+What is kept is found by the digest of all that it depends on: the software, every count and every number of the
+experiment but its title and material, and what the caller names besides. So a file that a work folder holds can be
+old, but never wrong.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import uuid
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,50 +17,91 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc.experiment import Experiment, Series
+from pdvc.digest import digest, software
+from pdvc.experiment import Experiment
+
+Arrays = Mapping[str, NDArray[Any]]
+Keep = Callable[[Callable[[], Arrays]], Arrays]
+"""`Store.arrays` with all but `make` given: makes arrays, or finds them kept."""
+
+_SEAL = hashlib.sha256().digest_size
+"""Bytes at the head of a kept file: the digest of the rest, an .npz archive."""
 
 
 class Store:
-    """Keep named arrays on disk, under names that tell experiments and purposes apart; without a folder, keep none."""
+    """Keep arrays on disk, under the digest of all that they depend on; without a folder, keep none."""
 
     def __init__(self, folder: Path | None, experiment: Experiment) -> None:
         self._folder = folder
-        self._reference = _fingerprint(experiment, (experiment.reference,)) if folder else ""
-        tested = (experiment.test, *(scan.series for scan in experiment.interrupted))
-        self._whole = _fingerprint(experiment, (experiment.reference, *tested)) if folder else ""
+        self._reference = reference_digest(experiment) if folder else ""
+        self._whole = experiment_digest(experiment) if folder else ""
 
-    def arrays(
-        self, name: str, make: Callable[[], Mapping[str, NDArray[Any]]], *, reference_alone: bool = False
-    ) -> Mapping[str, NDArray[Any]]:
-        """Return the arrays of that name, made and kept if they are not there; the name holds all they depend on.
+    def arrays(self, name: str, depends: tuple[Any, ...], make: Callable[[], Arrays]) -> Arrays:
+        """Return what `make` makes of the experiment and of what else it `depends` on; read where it was kept."""
+        return self._kept(name, (self._whole, *depends), make)
 
-        What depends on the reference scan alone is found again by every experiment that has the same one.
-        """
+    def of_reference(self, name: str, depends: tuple[Any, ...], make: Callable[[], Arrays]) -> Arrays:
+        """Return what `make` makes of the reference scan alone: every experiment with the same one finds it."""
+        return self._kept(name, (self._reference, *depends), make)
+
+    def _kept(self, name: str, depends: tuple[Any, ...], make: Callable[[], Arrays]) -> Arrays:
         if self._folder is None:
             return make()
-        key = self._reference if reference_alone else self._whole
-        digest = hashlib.sha256(f"{key} {name}".encode()).hexdigest()[:12]
-        path = self._folder / f"{name.split()[0]}-{digest}.npz"
-        if path.exists():
-            with np.load(path) as kept:
-                return dict(kept)
+        path = self._folder / f"{name}-{digest(name, *depends)}.kept"
+        found = _read(path)
+        if found is not None:
+            return found
         values = make()
+        content = io.BytesIO()
+        np.savez(content, allow_pickle=False, **values)
         self._folder.mkdir(parents=True, exist_ok=True)
         # another process may keep the same at the same time: each writes its own file
         partial = path.with_suffix(f".{uuid.uuid4().hex}.partial")
-        with partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **values)
-        partial.replace(path)
+        try:
+            with partial.open("wb") as file:
+                file.write(hashlib.sha256(content.getbuffer()).digest())
+                file.write(content.getbuffer())
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
         return values
 
 
-def _fingerprint(experiment: Experiment, stacks: tuple[Series, ...]) -> str:
-    """Return a digest of geometry, flats and darks, and of the stacks: angles, forces, and a sample of the counts."""
-    digest = hashlib.sha256(repr(experiment.geometry).encode())
-    for series in stacks:
-        every = max(1, len(series) // 8)
-        for part in (series.angle_rad, series.force_N, series.counts[::every]):
-            digest.update(np.ascontiguousarray(part).tobytes())
-    for images in (experiment.flats, experiment.darks):
-        digest.update(np.ascontiguousarray(images).tobytes())
-    return digest.hexdigest()
+def _read(path: Path) -> Arrays | None:
+    """Return the arrays of a file; None where it is not there, cut short or damaged: then they are made again."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    seal, rest = content[:_SEAL], memoryview(content)[_SEAL:]
+    if hashlib.sha256(rest).digest() != seal:
+        return None
+    with np.load(io.BytesIO(rest)) as kept:
+        return dict(kept)
+
+
+def reference_digest(experiment: Experiment) -> str:
+    """Return a digest of the software and of all that a reconstruction of the reference scan may depend on."""
+    return digest(software("pdvc"), *_scanner(experiment), experiment.reference)
+
+
+def experiment_digest(experiment: Experiment) -> str:
+    """Return a digest of the software and of all of an experiment but its title and material."""
+    return digest(
+        software("pdvc"),
+        *_scanner(experiment),
+        experiment.reference,
+        experiment.test,
+        tuple(experiment.interrupted),
+    )
+
+
+def _scanner(experiment: Experiment) -> tuple[Any, ...]:
+    return (
+        experiment.geometry,
+        experiment.frames,
+        experiment.photons_per_count,
+        experiment.readout_noise_counts,
+        experiment.flats,
+        experiment.darks,
+    )

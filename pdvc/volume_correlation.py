@@ -108,7 +108,8 @@ def correlate(
     prepared = time.perf_counter()
     found = {
         scan.step: store.arrays(
-            f"correlation of step {scan.step} {options.model_dump()}",
+            "correlation",
+            (scan.step, options),
             lambda scan=scan: _correlated(bench, references, scan, progress),  # type: ignore[misc]
         )
         for scan in experiment.interrupted
@@ -188,19 +189,19 @@ class _Bench:
         self, references: Mapping[int, Volume], scan: InterruptedScan, progress: Progress
     ) -> dict[int, VolumePair]:
         """Reconstruct an interrupted scan, inside the hull that its own views show, to be compared."""
-        series, calibration, choice = scan.series, self.calibration, self.options.beam_hardening
+        series, calibration = scan.series, self.calibration
         outline = outlined(
             series,
             self.geometry,
             calibration.with_polynomial(IDENTITY),
             calibration.polynomial,
-            partial(self.store.arrays, f"outline of step {scan.step} {choice}"),
+            partial(self.store.arrays, "outline", (scan.step, calibration)),
             progress,
         )
         low, high = self.bases["deformation"].height_mm[[0, -1]]
 
         def pair(scale: int) -> VolumePair:
-            keep = partial(self.store.arrays, f"volume of step {scan.step}, scale {scale} {choice}")
+            keep = partial(self.store.arrays, "volume", (scan.step, scale, calibration, outline.hull))
             volume = scan_volume(series, self.geometry, calibration, outline.hull, scale, 0.0, keep, progress)
             return VolumePair(
                 reference=references[scale],

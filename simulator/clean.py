@@ -2,24 +2,22 @@
 
 A stack is kept as ``reference-KEY.npy``, ``test-KEY.npy`` or ``interrupted-KEY.npy``, float32 (image, row, column):
 the share of the open beam that each pixel sees, as `simulator.detector.seen` returns it. KEY is a digest of exactly
-those parts of a scenario that the stack depends on, and of this software's version: not of photons, frames, readout,
+those parts of a scenario that the stack depends on, and of this software: not of photons, frames, readout,
 gain, flats or repetition. Each stack has a key of its own, so that what changes the test alone, as its motion does,
 leaves the reference scan.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import uuid
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.digest import digest, software
 from pdvc.progress import Progress, silent
 from simulator.scenario import Scenario, course_of
 from simulator.side_by_side import in_order
@@ -32,8 +30,7 @@ _TEST = ("test_steps", "steps_per_turn", "step_s")
 
 def clean_file(scenario: Scenario, stack: Stack) -> str:
     """Return the name of the file in which a noise-free stack is kept."""
-    text = json.dumps(_depends_on(scenario, stack), sort_keys=True)
-    return f"{stack.kind}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npy"
+    return f"{stack.kind}-{digest(_depends_on(scenario, stack))}.npy"
 
 
 def clean_stack(
@@ -91,7 +88,7 @@ def _depends_on(scenario: Scenario, stack: Stack) -> dict[str, Any]:
         plan |= set(_TEST)
     spectrum = read_spectrum(scenario.xray.spectrum)
     return {
-        "version": version("pdvc-bench"),
+        "software": software("simulator"),
         "stack": [stack.kind, stack.step, image_count(scenario, stack)],
         # the name may be that of a file, whose content may change
         "spectrum": [spectrum.energy_keV.tolist(), spectrum.fluence.tolist()],

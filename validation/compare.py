@@ -13,17 +13,15 @@ bit. Methods that do not look at interrupted scans are not handed any.
 
 from __future__ import annotations
 
-import hashlib
 import inspect
-import json
 import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 
+from pdvc.digest import digest, software
 from pdvc.experiment import Experiment
 from pdvc.lock import held
 from pdvc.measurement import Measurement
@@ -54,15 +52,14 @@ class MethodRun:
 
     @cached_property
     def key(self) -> str:
-        """Return a digest of all that the result depends on: scenario, method, its file, and version."""
-        texts = [
+        """Return a digest of all that the result depends on: scenario, method, its file, and software."""
+        return digest(
             self.scenario.model_dump_json(exclude={"name", "title", "material"}),
             *(clean_file(self.scenario, stack) for stack in stacks_of(self.scenario)),
             self.method,
             _source(find_method(self.method)),
-            version("pdvc-bench"),
-        ]
-        return hashlib.sha256(json.dumps(texts).encode()).hexdigest()[:20]
+            software("pdvc", "simulator", "validation"),
+        )
 
     @property
     def columns(self) -> Mapping[str, Scalar]:

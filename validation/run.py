@@ -9,7 +9,6 @@ DIR/work/             state.json, and intermediate results of an unfinished meas
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import sys
@@ -17,14 +16,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pdvc.digest import digest
 from pdvc.experiment import DESCRIPTION, Experiment, read_experiment
 from pdvc.lock import held
 from pdvc.measurement import Measurement, MeasurementError, read_measurement, write_measurement
 from pdvc.progress import Progress, silent
+from pdvc.store import experiment_digest
 from pdvc.whole import write_whole
 from validation.measuring import check_finite
 from validation.report import write_report
@@ -67,7 +67,7 @@ class State:
     """Hold what earlier attempts did in a folder, so that the next one knows what still holds."""
 
     measurement: str = ""
-    """Fingerprint of the software's version, options and experiment that measurement.nc belongs to."""
+    """Digest of software, options and experiment, every count of it, that measurement.nc belongs to."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent so far, s, all attempts together."""
     peak_memory_gib: float = 0.0
@@ -150,7 +150,7 @@ def _measure(
     job: Job, state: State, state_path: Path, experiment: Experiment, progress: Progress
 ) -> tuple[Measurement, bool]:
     """Measure unless that is done with the same options; returns the measurement and whether it was."""
-    wanted = fingerprint(version("pdvc-bench"), job.options.template(), *_file_stamps(job.experiment))
+    wanted = digest(job.options, experiment_digest(experiment), experiment.title)
     if job.measurement.exists() and state.measurement == wanted:
         # one that was damaged since is made again
         with suppress(MeasurementError):
@@ -175,23 +175,6 @@ def _noting(part: str, state: State, path: Path) -> Iterator[None]:
         state.seconds[part] = state.seconds.get(part, 0.0) + time.perf_counter() - start
         state.peak_memory_gib = max(state.peak_memory_gib, peak_memory_gib())
         state.write(path)
-
-
-def fingerprint(*texts: str) -> str:
-    """Return a short text that differs where any of the texts differs."""
-    digest = hashlib.sha256()
-    for text in texts:
-        digest.update(len(text).to_bytes(8, "big") + text.encode("utf-8"))
-    return digest.hexdigest()[:16]
-
-
-def _file_stamps(folder: Path) -> list[str]:
-    """Return what changes when an experiment's files do: the description's text, the others' size and time."""
-    stamps = [(folder / DESCRIPTION).read_text(encoding="utf-8")]
-    for path in sorted(folder.rglob("*.tif")):
-        status = path.stat()
-        stamps.append(f"{path.relative_to(folder)} {status.st_size} {status.st_mtime_ns}")
-    return stamps
 
 
 def write_text(path: Path, text: str) -> None:

@@ -15,8 +15,6 @@ measurement. `validation.runs` says when shared things are removed.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import shutil
 import tempfile
@@ -27,13 +25,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.digest import digest, software
 from pdvc.experiment import Experiment, read_experiment
 from pdvc.measure import measure
 from pdvc.measurement import Measurement
@@ -71,13 +69,13 @@ class Trial:
 
     @cached_property
     def key(self) -> str:
-        """Return a digest of all that the result depends on: scenario, options and version; not names and factors."""
-        return _digest(
+        """Return a digest of all that the result depends on: scenario, options and software; not names and factors."""
+        return digest(
             self.scenario.model_dump_json(exclude={"name", "title", "material"}),
             # a spectrum may be a file: its content counts, not its name
             clean_file(self.scenario, Stack("reference")),
-            self.options.model_dump_json(),
-            version("pdvc-bench"),
+            self.options,
+            software("pdvc", "simulator", "validation"),
         )
 
     @property
@@ -141,13 +139,13 @@ class Volumes:
         """Return their folder in the shared folder: a digest of the counts' origin, and of the options that matter."""
         scenario = self.scenario
         options = resolved(self.options, scenario.geometry.cone_beam())
-        digest = _digest(
+        key = digest(
             clean_file(scenario, Stack("reference")),
-            scenario.detector.model_dump_json(),
-            f"{scenario.repetition} {scenario.loading.plateau_N} {scenario.acquisition.force_noise_N}",
-            repr(volume_choices(options)),
+            scenario.detector,
+            (scenario.repetition, scenario.loading.plateau_N, scenario.acquisition.force_noise_N),
+            volume_choices(options),
         )
-        return f"volumes-{digest}"
+        return f"volumes-{key}"
 
     def needs(self) -> tuple[Part, ...]:
         """Return the clean stacks from which the counts are made."""
@@ -172,12 +170,13 @@ class LeastError:
     @cached_property
     def name(self) -> str:
         """Return its file: a digest of the clean stacks, the detector, and the options on which unknowns depend."""
-        digest = _digest(
+        key = digest(
             *(part.name for part in clean_parts(self.scenario)),
-            self.scenario.detector.model_dump_json(),
+            self.scenario.detector,
             self.options.model_dump_json(exclude=_HOW_TO_SOLVE),
+            software("pdvc", "simulator", "validation"),
         )
-        return f"bounds/{digest}.json"
+        return f"bounds/{key}.json"
 
     def needs(self) -> tuple[Part, ...]:
         """Return the clean stacks."""
@@ -265,7 +264,3 @@ def _columns(record: Any, prefix: str) -> Iterator[tuple[str, type]]:
             yield prefix + name, kind
         else:
             raise TypeError(f"Scores.{prefix}{name}: expected a number, a text or a record of these, got {kind}")
-
-
-def _digest(*texts: str) -> str:
-    return hashlib.sha256(json.dumps(texts).encode()).hexdigest()[:20]
