@@ -54,9 +54,12 @@ def find_outline(
     """Reconstruct coarsely, outline the sample and fit the polynomial, unless one is given.
 
     `view(i)` returns the attenuation (row, column) of coarse view i, without unit; `geometry` is theirs.
-    A given polynomial is only scaled, so that the largest attenuation becomes 1.
+    A given polynomial is only scaled, so that the largest attenuation becomes 1. Raises ValueError where it falls
+    somewhere: then grey levels do not tell attenuations.
     """
     views = [view(i) for i in range(len(angle_rad))]
+    if polynomial is not None:
+        _check_rising(polynomial, max(float(np.percentile(image, 99.9)) for image in views))
     grid = _whole_grid(geometry)
     fitted = polynomial or (1.0, 0.0, 0.0)
     for _ in range(1 if polynomial else 2):
@@ -72,6 +75,17 @@ def find_outline(
 def _apply(attenuation: Image, polynomial: tuple[float, float, float]) -> Image:
     c1, c2, c3 = (np.float32(c) for c in polynomial)
     return np.asarray(attenuation * (c1 + attenuation * (c2 + attenuation * c3)), dtype=np.float32)
+
+
+def _check_rising(polynomial: tuple[float, float, float], most: float) -> None:
+    c1, c2, c3 = polynomial
+    q = np.linspace(0, max(most, 0.0), 100)
+    falls = np.flatnonzero(c1 + 2 * c2 * q + 3 * c3 * q**2 <= 0)
+    if len(falls):
+        raise ValueError(
+            f"beam_hardening: expected grey levels that rise with attenuation up to {most:.3g}, the largest here, got "
+            f"{list(polynomial)}, which falls at {q[falls[0]]:.3g}"
+        )
 
 
 def _whole_grid(geometry: ConeBeam) -> Grid:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from pdvc.progress import Progress, silent
@@ -18,6 +19,8 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 STEPS_AT_ONCE = 8
+COPIES = 10
+"""Matrices of all unknowns that are held at a time: Hessian, inverse, parts of the noise, their products."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +68,21 @@ class Equations:
 
 Linearise = Callable[[Floats], Equations]
 """From trial amplitudes (step, section, motion) to the equations there."""
+
+
+def check_size(time_functions: Floats, basis: SectionBasis) -> None:
+    """Raise ValueError where the equations and the covariance of all unknowns do not fit into memory."""
+    functions, steps = time_functions.shape
+    size = basis.shape[0] * basis.shape[1]
+    joined = functions * size if np.count_nonzero(time_functions, axis=0).max() > 1 else size
+    needed = 8 * (2 * steps * size**2 + COPIES * joined**2)
+    free = psutil.virtual_memory().available
+    if needed > free:
+        raise ValueError(
+            f"sections, time: expected unknowns that fit into memory, got {functions} time functions of "
+            f"{basis.shape[0]} sections with {basis.shape[1]} motions, which need {needed / 2**30:.1f} GiB where "
+            f"{free / 2**30:.1f} are free"
+        )
 
 
 def linearise(

@@ -24,6 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior, solved
 from pdvc.solution import SHORTER, Solution, evaluated, lowers
+from pdvc.verdict import Stop
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -98,6 +99,7 @@ def solve(
         temporal=np.empty((0, time_functions.shape[1])),
         spatial=np.empty((0, *shape[1:])),
         rms=np.array(rms),
+        stop=Stop.UNFINISHED if moving else Stop.NO_GAIN if stuck == len(blocks) else Stop.CONVERGED,
         stop_reason=_reason(len(blocks), len(moving), stuck, last, least_change_voxel, most_passes),
     )
 

@@ -16,6 +16,7 @@ from pydantic import Field
 from scipy.interpolate import BSpline
 
 from pdvc.experiment import Series
+from pdvc.onset import onset
 from pdvc.settings import Settings
 
 Floats = NDArray[np.float64]
@@ -68,14 +69,17 @@ class Ramp(Settings):
 
     kind: Literal["ramp"] = "ramp"
     """powers of the steps since a start"""
-    start: int = 50
-    """step at which the ramp leaves zero"""
+    start: Annotated[int, Field(ge=0)] | Literal["onset"] = "onset"
+    """step at which the ramp leaves zero; onset: where the force leaves its plateau"""
     powers: tuple[Annotated[int, Field(ge=0)], ...] = (1, 2)
     """exponents; 0 makes a jump at the start"""
 
     def functions(self, series: Series) -> Floats:
-        """Return (powers, step)."""
-        since = (np.arange(len(series)) - self.start) / len(series)
+        """Return (powers, step); zero everywhere where the force has no onset, or the start is after the last step."""
+        start = onset(series.force_N) if self.start == "onset" else self.start
+        if start is None:
+            return np.zeros((len(self.powers), len(series)))
+        since = (np.arange(len(series)) - start) / len(series)
         return np.stack([np.where(since > 0, since**power, 0.0) for power in self.powers])
 
 
@@ -153,6 +157,17 @@ def time_basis(parts: tuple[TimeFunctions, ...], series: Series) -> Floats:
     if not kept:
         raise ValueError("time functions: expected at least one that is not zero over the steps")
     return np.stack(kept) * np.sqrt(len(series))
+
+
+def with_onset(parts: tuple[TimeFunctions, ...], series: Series) -> tuple[TimeFunctions, ...]:
+    """Return the time functions with the onset of loading as a step, where the force shows one."""
+    found = onset(series.force_N)
+    return tuple(
+        part.model_copy(update={"start": found})
+        if isinstance(part, Ramp) and part.start == "onset" and found is not None
+        else part
+        for part in parts
+    )
 
 
 def _unit(count: int) -> Floats:

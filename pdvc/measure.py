@@ -9,6 +9,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,19 +19,24 @@ from numpy.typing import NDArray
 
 from pdvc import gauss_newton, pgd
 from pdvc.compilation import compile_kernels
-from pdvc.equations import Equations, linearise, residuals
+from pdvc.data_checks import check_usable, doubts_of_data, doubts_of_time
+from pdvc.equations import Equations, check_size, linearise, residuals
+from pdvc.examination import examine, with_angles
 from pdvc.experiment import Experiment
-from pdvc.history import time_basis
+from pdvc.history import time_basis, with_onset
 from pdvc.measurement import Measurement, Stage, step_covariance, turned_std
 from pdvc.noise import known_from_residual, propagate
 from pdvc.options import MeasureOptions, StageOptions, resolved
-from pdvc.preparation import Prepared, bases, calibrated, noise_of, prepare, snr_of, used_window
+from pdvc.preparation import Prepared, bases, calibrated, noise_of, prepare, snr_of
 from pdvc.prior import Prior
 from pdvc.progress import Progress, silent
+from pdvc.result_checks import doubts_of_result
 from pdvc.sections import SectionBasis
 from pdvc.solution import Solution
 from pdvc.store import Store
 from pdvc.uncertainty import posterior
+from pdvc.verdict import Stop, Verdict
+from pdvc.window import used_window
 
 __all__ = ["MeasureOptions", "StageOptions", "measure"]
 
@@ -49,11 +55,17 @@ def measure(
     compile_kernels(progress=progress)
     started = time.perf_counter()
     options = resolved(options, experiment.geometry)
-    window = used_window(experiment.geometry, options)
+    options = options.model_copy(update={"time": with_onset(options.time, experiment.test)})
+    time_functions = time_basis(options.time, experiment.test)
+    examined = examine(experiment, progress=progress)
+    check_usable(examined, experiment)
+    examined = with_angles(examined, experiment, progress=progress)
     store = Store(work, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)
-    time_functions = time_basis(options.time, experiment.test)
+    window = used_window(experiment.geometry, options, outline.hull)
+    options = options.model_copy(update={"discard_rows": window[0], "discard_columns": window[2]})
     rigid, sections = bases(experiment.geometry, window, outline.hull, options)
+    check_size(time_functions, sections)
     scales = {_scale(stage) for stage in (*options.rigid, *options.deformation)}
     prepared = {
         scale: prepare(experiment, calibration, outline, window, scale, options, store, progress)
@@ -85,11 +97,14 @@ def measure(
         equations.residual,
         progress=progress,
     )
+    task = f"covariance of {len(time_functions) * standing[0].size} unknowns"
+    progress(task, 0, 1)
     known = posterior(equations, time_functions, _prior(sections, options), propagated.parts)
+    progress(task, 1, 1)
     amplitude[:, ~known.observed] = np.nan
     snr = snr_of(fine.images)
     ended = time.perf_counter()
-    return Measurement(
+    found = Measurement(
         title=experiment.title,
         voxel_mm=experiment.geometry.voxel_mm,
         source_axis_mm=experiment.geometry.source_axis_mm,
@@ -127,6 +142,12 @@ def measure(
         options=options.template(),
         versions=versions(),
     )
+    doubts = (
+        *doubts_of_data(examined, experiment),
+        *doubts_of_time(options.time, experiment.test),
+        *doubts_of_result(found, fine.images.volume, experiment.geometry, options.prior_voxel),
+    )
+    return replace(found, verdict=Verdict(doubts=doubts))
 
 
 def _on_the_axis(
@@ -183,6 +204,7 @@ class _Solver:
                     temporal=kept["temporal"],
                     spatial=kept["spatial"],
                     rms=kept["rms"],
+                    stop=Stop(str(kept["stop"])),
                     stop_reason=str(kept["stop_reason"]),
                 )
             )
@@ -236,6 +258,7 @@ def _packed(solution: Solution) -> dict[str, NDArray[Any]]:
         "temporal": solution.temporal,
         "spatial": solution.spatial,
         "rms": solution.rms,
+        "stop": np.array(str(solution.stop)),
         "stop_reason": np.array(solution.stop_reason),
     }
 

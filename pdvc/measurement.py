@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
@@ -10,11 +11,12 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from pdvc.sections import SectionBasis
+from pdvc.verdict import UNCHECKED, Doubt, Stop, Verdict
 from pdvc.whole import read_netcdf, write_netcdf
 
 Floats = NDArray[np.float64]
 _COVARIANCE_AXES = ("function", "coefficient", "coefficient_")
-FORMAT = 2
+FORMAT = 3
 """Raised whenever a file of an older version can no longer be read."""
 
 
@@ -40,8 +42,10 @@ class Stage:
     """Section amplitudes (mode, section, motion) in voxels; one section in the rigid stage."""
     rms: Floats
     """Rms residual over used pixels and steps before each pass and after the last, grey levels."""
+    stop: Stop
+    """Why the stage ended, for machines."""
     stop_reason: str
-    """Why the stage ended, and what a user can do about it."""
+    """Why the stage ended, in words and numbers."""
 
     @property
     def modes(self) -> int:
@@ -114,6 +118,8 @@ class Measurement:
     std_by_source: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """What noise of radiographs, views and flats, and the prior, each make of the standard deviation of u on the axis:
     rms over steps and observed sections, voxels, across the beam, vertical, along the beam. Squares add up."""
+    verdict: Verdict = UNCHECKED
+    """What speaks against the measurement."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time spent, by part: at least ``reconstruct`` and ``measure``."""
     options: str = ""
@@ -201,6 +207,7 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
             "angle": ("step", m.angle_rad, {"units": "rad"}),
             "time": ("step", m.time_s, {"units": "s"}),
             "force": ("step", m.force_N, {"units": "N"}),
+            "step_doubts": ("step", [", ".join(m.verdict.of_step(t)) for t in range(len(m.angle_rad))]),
             "section_height": ("section", m.basis.height_mm, {"units": "mm"}),
             "time_functions": (("function", "step"), m.time_functions),
             "amplitude": (("step", "section", "motion"), m.amplitude, {"units": "voxel"}),
@@ -227,6 +234,8 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
             "source_axis_mm": m.source_axis_mm,
             "section_radius_mm": m.basis.radius_mm,
             "window": np.array(m.window),
+            "verdict": m.verdict.word,
+            "doubts": json.dumps([asdict(doubt) for doubt in m.verdict.doubts]),
             "options": m.options,
             "versions": m.versions,
             **{f"seconds_{name}": value for name, value in m.seconds.items()},
@@ -247,6 +256,7 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
         data[f"{name}_rms"] = (f"{name}_pass", stage.rms)
         for key in ("name", "scale", "solver", "unknowns", "stop_reason"):
             data.attrs[f"{name}_{key}"] = getattr(stage, key)
+        data.attrs[f"{name}_stop"] = str(stage.stop)
     data.attrs["stages"] = len(m.stages)
     packed = {name: _packing(data[name].values) for name in data if str(name).startswith("residual_")}
     if m.std_by_source:
@@ -303,6 +313,7 @@ def _unpack(data: xr.Dataset) -> Measurement:
             temporal=get(f"{name}_temporal"),
             spatial=get(f"{name}_spatial"),
             rms=get(f"{name}_rms"),
+            stop=Stop(attrs[f"{name}_stop"]),
             stop_reason=str(attrs[f"{name}_stop_reason"]),
         )
         for name in (f"stage{n}" for n in range(int(attrs["stages"])))
@@ -347,6 +358,9 @@ def _unpack(data: xr.Dataset) -> Measurement:
         }
         if "source" in data
         else {},
+        verdict=Verdict(
+            doubts=tuple(Doubt(**{**each, "steps": tuple(each["steps"])}) for each in json.loads(str(attrs["doubts"])))
+        ),
         seconds={
             name.removeprefix("seconds_"): float(value)
             for name, value in attrs.items()

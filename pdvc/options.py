@@ -50,14 +50,14 @@ class MeasureOptions(Settings):
     """
 
     discard_rows: Annotated[int, Field(ge=0)] | None = None
-    """rows left out at the top and at the bottom, px; default: 100 of 954, as in the paper"""
+    """rows left out at the top and at the bottom, px; default: 100 of 954, or more where rays need it"""
     discard_columns: Annotated[int, Field(ge=0)] | None = None
-    """columns left out on the left and on the right, px; default: 60 of 432, as in the paper"""
+    """columns left out on the left and on the right, px; default: 60 of 432, or less for a wide sample"""
     sections: Annotated[int, Field(ge=2)] = 15
     """sections, equally spaced over the used height"""
     section_motions: tuple[str, ...] = (*RIGID, CONTRACTION)
     """motions of a section: six rigid ones, and contraction"""
-    time: tuple[TimeFunctions, ...] = (*PAPER[:3], Ramp(start=50, powers=(0, 1, 2, 3)))
+    time: tuple[TimeFunctions, ...] = (*PAPER[:3], Ramp(powers=(0, 1, 2, 3)))
     """time functions: Table 1, and a jump and a cube at the start of loading"""
     rigid: tuple[StageOptions, ...] = COARSE_TO_FINE_RIGID
     """the sample as one rigid body; one stage or several, from coarse to fine"""
@@ -92,6 +92,9 @@ class MeasureOptions(Settings):
     @classmethod
     def _known_motions(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         SectionBasis(height_mm=[0.0], radius_mm=1.0, motions=names)  # type: ignore[arg-type]  # raises if unknown
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"every motion once, {', '.join(twice)} stands there twice")
         return names
 
 
@@ -101,12 +104,11 @@ def coarse_scale(geometry: ConeBeam) -> int:
 
 
 def resolved(options: MeasureOptions, geometry: ConeBeam) -> MeasureOptions:
-    """Return the options with everything filled in that depends on the detector.
+    """Return the options with everything filled in that depends on the detector alone: the coarse scale.
 
     Raises ValueError where nothing of the radiographs would be left.
     """
-    rows = round(geometry.rows * 100 / 954) if options.discard_rows is None else options.discard_rows
-    columns = round(geometry.columns * 60 / 432) if options.discard_columns is None else options.discard_columns
+    rows, columns = options.discard_rows or 0, options.discard_columns or 0
     if 2 * rows >= geometry.rows or 2 * columns >= geometry.columns:
         raise ValueError(
             f"discard_rows, discard_columns: expected to leave some of {geometry.rows} x {geometry.columns} px, "
@@ -120,7 +122,7 @@ def resolved(options: MeasureOptions, geometry: ConeBeam) -> MeasureOptions:
         )
         for name in ("rigid", "deformation")
     }
-    return options.model_copy(update={"discard_rows": rows, "discard_columns": columns, **stages})
+    return options.model_copy(update=stages)
 
 
 def paper_options() -> MeasureOptions:

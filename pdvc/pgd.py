@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior, solved
 from pdvc.solution import SHORTER, Solution, evaluated, lowers
+from pdvc.verdict import Stop
 
 Floats = NDArray[np.float64]
 
@@ -52,11 +53,12 @@ def solve(
     at = evaluated(linearise, time_functions, shape)
     equations = at(coefficients)
     rms, temporal, spatial = [equations.rms], [], []
-    reason = f"{most_modes} modes found, the most allowed: allow more if the residual still shows motion"
+    stop, reason = Stop.MOST, f"{most_modes} modes found, as many as were asked for"
     for _ in range(most_modes):
         if noise_rms is not None and equations.rms**2 <= 2 * noise_rms**2:
-            reason = (
-                f"residual at noise level: rms {equations.rms:.3g} within sqrt(2) times {noise_rms:.3g} grey levels"
+            stop, reason = (
+                Stop.NOISE_LEVEL,
+                (f"residual at noise level: rms {equations.rms:.3g} within sqrt(2) times {noise_rms:.3g} grey levels"),
             )
             break
         before = equations.rms
@@ -72,13 +74,17 @@ def solve(
             if gain < WORTH_A_PASS:
                 break
         if not b.any():
-            reason = "no further mode lowers the residual: what is left lies outside the bases, or is noise"
+            stop, reason = (
+                Stop.NO_GAIN,
+                ("no further mode lowers the residual: what is left lies outside the bases, or is noise"),
+            )
             break
         coefficients = coefficients + np.outer(a, b)
         temporal.append(a @ time_functions)
         spatial.append(b.reshape(shape[1:]))
         gain = 1 - equations.rms / before
         if gain < least_gain:
+            stop = Stop.SMALL_GAIN
             reason = f"the last mode lowered the rms residual by {gain:.2%}, less than {least_gain:.2%}"
             break
     return Solution(
@@ -87,6 +93,7 @@ def solve(
         temporal=np.array(temporal).reshape(-1, time_functions.shape[1]),
         spatial=np.array(spatial).reshape(-1, *shape[1:]),
         rms=np.array(rms),
+        stop=stop,
         stop_reason=reason,
     )
 

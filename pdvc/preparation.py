@@ -32,11 +32,12 @@ from pdvc.radiographs import (
     snr_db,
 )
 from pdvc.rays import ray_vectors
-from pdvc.reconstruction import fdk, seen_half_height_mm
+from pdvc.reconstruction import fdk
 from pdvc.sections import RIGID, SectionBasis
 from pdvc.store import Keep, Store
 from pdvc.systematic import Neighbours, Systematic, neighbouring_views
-from pdvc.volume import Grid, Hull, Volume
+from pdvc.volume import Hull, Volume
+from pdvc.window import height_mm, reached_rows, scan_grid
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -45,6 +46,7 @@ _OUTLINE_ROWS = 240
 """The outline is found on radiographs binned to about this many rows."""
 _OUTLINE_VIEWS = 150
 _HULL_MARGIN_VOXEL = 3.0
+ROWS_OF_A_SECTION = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,12 +61,6 @@ class Prepared:
     snr_reprojection_db: Floats
     snr_noise_db: Floats
     noise_rms: float | None
-
-
-def used_window(geometry: ConeBeam, options: MeasureOptions) -> tuple[int, int, int, int]:
-    """Return the used rows and columns: row_from, row_to, column_from, column_to."""
-    rows, columns = options.discard_rows or 0, options.discard_columns or 0
-    return rows, geometry.rows - rows, columns, geometry.columns - columns
 
 
 def calibrated(
@@ -114,20 +110,22 @@ def outlined(
 def bases(
     geometry: ConeBeam, window: tuple[int, int, int, int], hull: Hull, options: MeasureOptions
 ) -> tuple[SectionBasis, SectionBasis]:
-    """Return the rigid basis, one section, and the section basis, spread over the used height."""
+    """Return the rigid basis, one section, and the section basis, spread over the used height.
+
+    Raises ValueError for sections closer to each other than two rows.
+    """
+    if options.sections > max((window[1] - window[0]) / ROWS_OF_A_SECTION, 2):
+        raise ValueError(
+            f"sections: expected at most one for every {ROWS_OF_A_SECTION} of the {window[1] - window[0]} used rows, "
+            f"got {options.sections}"
+        )
     low, high = hull.box_mm()
     radius = float(np.hypot(*(high - low)[:2]) / 4)
-    top = _height_mm(geometry, window[0] - 0.5)
-    bottom = _height_mm(geometry, window[1] - 0.5)
+    top = height_mm(geometry, window[0] - 0.5)
+    bottom = height_mm(geometry, window[1] - 0.5)
     heights = np.linspace(bottom, top, options.sections)
     rigid = SectionBasis(height_mm=np.array([(top + bottom) / 2]), radius_mm=radius, motions=RIGID)
     return rigid, SectionBasis(height_mm=heights, radius_mm=radius, motions=options.section_motions)
-
-
-def _height_mm(geometry: ConeBeam, row: float) -> float:
-    """Return the height at which the middle of a detector row looks through the axis, mm."""
-    down = (row - (geometry.rows - 1) / 2) * geometry.pixel_mm + geometry.row_shift_mm
-    return -down / geometry.magnification
 
 
 def prepare(
@@ -232,14 +230,7 @@ def scan_volume(
 ) -> Volume:
     """Reconstruct a full scan at a scale, inside a hull; `geometry` is that of scale 1."""
     view, geometry = _viewer(series, calibration, scale, smooth_px), geometry.binned(scale)
-    low, high = hull.box_mm()
-    radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
-    reach = seen_half_height_mm(geometry, radius)
-    # two voxels of air around the hull keep interpolation, and its gradient, inside the grid
-    margin = np.full(3, 2 * geometry.voxel_mm)
-    low, high = low - margin, high + margin
-    low[2], high[2] = max(low[2], -reach), min(high[2], reach)
-    grid = Grid.around(low, high, geometry.voxel_mm)
+    grid = scan_grid(geometry, hull)
 
     def reconstructed() -> dict[str, NDArray[np.float32]]:
         task = f"reconstruct {geometry.voxel_mm * 1e3:.1f} um"
@@ -264,7 +255,7 @@ def _systematic(
     rays = ray_vectors(geometry, reference[needed]).stacked()
     fields = np.zeros((len(needed), geometry.rows, geometry.columns), dtype=np.float32)
     snr = np.empty(len(needed))
-    reached = _reached_rows(geometry, volume)
+    reached = reached_rows(geometry, volume.grid, volume.hull)
     window = (slice(part[0], part[1]), slice(part[2], part[3]))
     for n, i in enumerate(needed):
         grey = view(int(i))
@@ -281,17 +272,6 @@ def _systematic(
         shape=(part[1] - part[0], part[3] - part[2]),
     )
     return systematic, needed, snr
-
-
-def _reached_rows(geometry: ConeBeam, volume: Volume) -> slice:
-    """Return the rows whose rays stay within the volume's height where they cross the sample."""
-    low, high = volume.hull.box_mm()
-    radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
-    # projection.py ends rays at the first layer but one
-    z = volume.grid.origin_mm[2] + volume.grid.voxel_mm * np.array([1, volume.grid.shape[0] - 2])
-    down = -z * geometry.source_detector_mm / (geometry.source_axis_mm + radius) - geometry.row_shift_mm
-    rows = down / geometry.pixel_mm + (geometry.rows - 1) / 2
-    return slice(max(int(np.ceil(rows[1])) + 1, 0), min(int(np.floor(rows[0])), geometry.rows))
 
 
 def _test_radiographs(

@@ -45,6 +45,16 @@ class Calibration:
         """Return the calibration with another polynomial."""
         return replace(self, polynomial=polynomial)
 
+    def binned(self, factor: int) -> Calibration:
+        """Return the calibration of counts that were averaged over blocks of factor x factor pixels, as by `binned`.
+
+        A block is bad where any of its pixels is: quicker than to fill them, for looking at radiographs alone.
+        """
+        if factor == 1:
+            return self
+        dark, beam, bad = (binned(image.astype(np.float32), factor) for image in (self.dark, self.open_beam, self.bad))
+        return replace(self, dark=dark, open_beam=beam, bad=np.asarray(bad > 0))
+
 
 def calibrate(experiment: Experiment) -> Calibration:
     """Average flats and darks, and find the bad pixels in them.
@@ -72,7 +82,7 @@ def _stands_out(image: Floats) -> NDArray[np.bool_]:
     return np.asarray(deviation > 8 * 1.4826 * max(float(np.median(deviation)), 0.5))
 
 
-def grey_levels(counts: NDArray[np.uint16], calibration: Calibration) -> Image:
+def grey_levels(counts: NDArray[np.uint16] | Image, calibration: Calibration) -> Image:
     """Turn one radiograph (row, column) of counts into grey levels; bad pixels take their neighbours' mean."""
     signal = np.maximum(counts.astype(np.float32) - calibration.dark, np.float32(1))
     attenuation = np.log(calibration.open_beam / signal)

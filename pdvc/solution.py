@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior
+from pdvc.verdict import Stop
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +29,7 @@ class Solution:
     """b (mode, section, motion), voxels."""
     rms: Floats
     """Rms residual (pass,), grey levels: before the first mode and after each."""
+    stop: Stop
     stop_reason: str
 
 

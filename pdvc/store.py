@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pdvc.digest import digest, software
 from pdvc.experiment import Experiment
+from pdvc.whole import write_whole
 
 Arrays = Mapping[str, NDArray[Any]]
 Keep = Callable[[Callable[[], Arrays]], Arrays]
@@ -54,16 +55,9 @@ class Store:
         values = make()
         content = io.BytesIO()
         np.savez(content, allow_pickle=False, **values)
-        self._folder.mkdir(parents=True, exist_ok=True)
+        sealed = hashlib.sha256(content.getbuffer()).digest() + content.getvalue()
         # another process may keep the same at the same time: each writes its own file
-        partial = path.with_suffix(f".{uuid.uuid4().hex}.partial")
-        try:
-            with partial.open("wb") as file:
-                file.write(hashlib.sha256(content.getbuffer()).digest())
-                file.write(content.getbuffer())
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        write_whole(path, sealed, partial=path.with_suffix(f".{uuid.uuid4().hex}.partial"))
         return values
 
 

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,23 +35,28 @@ from numpy.typing import NDArray
 
 from pdvc import gauss_newton
 from pdvc.compilation import compile_comparison, compile_kernels
+from pdvc.data_checks import check_usable, doubts_of_reference
 from pdvc.equations import Equations
+from pdvc.examination import examine, with_angles
 from pdvc.experiment import Experiment, InterruptedScan
 from pdvc.geometry import ConeBeam
 from pdvc.history import Steps, time_basis
 from pdvc.measure import versions
 from pdvc.measurement import Measurement, Stage
 from pdvc.options import MeasureOptions, coarse_scale, resolved
-from pdvc.preparation import bases, calibrated, outlined, reference_volume, scan_volume, used_window
+from pdvc.preparation import bases, calibrated, outlined, reference_volume, scan_volume
 from pdvc.prior import LEAST_RMS, Prior
 from pdvc.progress import Progress, silent
 from pdvc.radiographs import IDENTITY, Calibration, snr_db
+from pdvc.result_checks import doubts_of_solution
 from pdvc.sections import SectionBasis
 from pdvc.solution import Solution
 from pdvc.store import Store
 from pdvc.uncertainty import UNSEEN, sandwich
+from pdvc.verdict import Stop, Verdict
 from pdvc.volume import Volume, halved, smoothed
 from pdvc.volume_equations import Comparison, VolumePair, compare, used_voxels
+from pdvc.window import used_window
 
 __all__ = ["MeasureOptions", "correlate"]
 
@@ -88,9 +93,12 @@ def correlate(
     started = time.perf_counter()
     # volumes are filtered here, not the radiographs
     options = resolved(options, experiment.geometry).model_copy(update={"smooth_px": 0.0})
-    window = used_window(experiment.geometry, options)
+    examined = examine(experiment, progress=progress)
+    check_usable(examined, experiment)
+    examined = with_angles(examined, experiment, progress=progress)
     store = Store(work, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)
+    window = used_window(experiment.geometry, options, outline.hull)
     rigid, sections = bases(experiment.geometry, window, outline.hull, options)
     bench = _Bench(
         geometry=experiment.geometry,
@@ -127,7 +135,7 @@ def correlate(
 
     reconstructing, measuring = np.sum([each["seconds"] for each in found.values()], axis=0)
     nothing = np.zeros((len(experiment.test), 0, 0), dtype=np.float32)
-    return Measurement(
+    measured = Measurement(
         title=experiment.title,
         voxel_mm=experiment.geometry.voxel_mm,
         source_axis_mm=experiment.geometry.source_axis_mm,
@@ -160,6 +168,8 @@ def correlate(
         options=options.template(),
         versions=versions(),
     )
+    doubts = (*doubts_of_reference(examined, experiment), *doubts_of_solution(measured, options.prior_voxel))
+    return replace(measured, verdict=Verdict(doubts=doubts))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,6 +265,7 @@ def _correlated(
         "snr_final": np.array(snr_db(fine.deformed.values, last.residual, fine.used)),
         "rms": np.array([solution.rms[[0, -1]] for solution in solutions]),
         "voxels": np.array([solution.equations.pixels for solution in solutions]),
+        "stops": np.array([str(solution.stop) for solution in solutions]),
         "reasons": np.array([solution.stop_reason for solution in solutions]),
         "seconds": np.array([solving - started, time.perf_counter() - solving]),
     }
@@ -300,6 +311,7 @@ def _stages(bench: _Bench, found: Mapping[int, Mapping[str, NDArray[Any]]], step
     for n, (name, scale) in enumerate(bench.stages):
         shape = bench.bases[name].shape
         squares = sum(scan["voxels"][n] * scan["rms"][n] ** 2 for scan in scans)
+        unfinished = any(scan["stops"][n] == Stop.UNFINISHED for scan in scans)
         result.append(
             Stage(
                 name=name,
@@ -309,6 +321,7 @@ def _stages(bench: _Bench, found: Mapping[int, Mapping[str, NDArray[Any]]], step
                 temporal=np.empty((0, steps)),
                 spatial=np.empty((0, *shape)),
                 rms=np.sqrt(squares / sum(scan["voxels"][n] for scan in scans)),
+                stop=Stop.UNFINISHED if unfinished else Stop.CONVERGED,
                 stop_reason="; ".join(f"step {step}: {scan['reasons'][n]}" for step, scan in found.items()),
             )
         )

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pdvc.measurement import Measurement, Stage
 from pdvc.sections import SectionBasis
+from pdvc.verdict import Stop
 
 Floats = NDArray[np.float64]
 VOXEL_MM = 0.0107
@@ -87,6 +88,7 @@ def measurement(amplitude: Floats, *, unobserved: tuple[int, ...] = (), title: s
             temporal=rng.normal(size=(modes, steps)),
             spatial=rng.normal(size=(modes, count, motions)),
             rms=np.geomspace(0.1, 0.01, modes + 1),
+            stop=Stop.NO_GAIN,
             stop_reason="the residual no longer decreases",
         )
 

@@ -19,13 +19,12 @@ def scales(stages):
 
 
 @pytest.mark.parametrize(
-    ("rows", "columns", "discard_rows", "discard_columns", "coarse"),
-    [(954, 432, 100, 60, 8), (238, 108, 25, 15, 2)],
+    ("rows", "columns", "coarse"),
+    [(954, 432, 8), (238, 108, 2)],
     ids=["the paper's detector", "a quarter of it"],
 )
-def test_what_is_left_open_scales_with_the_detector(rows, columns, discard_rows, discard_columns, coarse):
+def test_the_scales_left_open_follow_the_detector(rows, columns, coarse):
     options = resolved(MeasureOptions(), scanner(rows, columns))
-    assert (options.discard_rows, options.discard_columns) == (discard_rows, discard_columns)
     assert scales(options.rigid) == [coarse, 2]
     assert scales(options.deformation) == [2, 1]
 
@@ -88,6 +87,11 @@ def test_unknown_motions_are_refused(names):
         MeasureOptions(section_motions=names)
 
 
+def test_a_motion_that_stands_there_twice_is_refused():
+    with pytest.raises(SettingsError, match="every motion once, rotation_x stands there twice"):
+        MeasureOptions.parse({"section_motions": ["rotation_x", "translation_x", "rotation_x"]}, where="options")
+
+
 @pytest.mark.parametrize(
     "options",
     [MeasureOptions(), paper_options(), resolved(MeasureOptions(), scanner(954, 432))],
@@ -101,7 +105,6 @@ def test_a_template_reads_back_as_the_same_options(tmp_path, options):
 
 def test_the_paper_s_options_are_the_paper_s():
     options = resolved(paper_options(), scanner(954, 432))
-    assert (options.discard_rows, options.discard_columns) == (100, 60)
     assert options.sections == 15
     assert options.section_motions == RIGID
     assert options.time == PAPER

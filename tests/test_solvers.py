@@ -16,6 +16,7 @@ from pdvc import gauss_newton, pgd
 from pdvc.equations import linearise, residuals
 from pdvc.prior import Prior
 from pdvc.systematic import Systematic
+from pdvc.verdict import Stop
 from tests.laws import law
 from tests.linear_problems import chi2_of, linear_model, random_equations, random_functions
 from tests.small_case import (
@@ -202,6 +203,7 @@ def test_gauss_newton_lowers_the_residual_in_each_of_ten_passes_at_most_and_says
     assert (np.diff(recovered().rms) < 0).all()
     assert recovered().rms[-1] < 1e-4 * recovered().rms[0]
     assert "converged" in recovered().stop_reason
+    assert recovered().stop is Stop.CONVERGED
     assert len(recovered().rms) <= 11
 
 
@@ -307,20 +309,24 @@ def greedy(**options):
 
 def test_pgd_stops_at_the_most_modes():
     found = greedy(most_modes=2)
-    assert "2 modes found, the most allowed: allow more" in found.stop_reason
+    assert "2 modes found, as many as were asked for" in found.stop_reason
+    assert found.stop is Stop.MOST
     assert len(found.temporal) == len(found.spatial) == len(found.rms) - 1 == 2
 
 
 def test_pgd_stops_at_a_mode_that_gains_too_little():
     found = greedy(most_modes=50, least_gain=0.5)
     assert "less than 50.00%" in found.stop_reason
+    assert found.stop is Stop.SMALL_GAIN
     assert len(found.temporal) == 1
 
 
 def test_pgd_stops_where_the_residual_is_that_of_two_noisy_images():
     """chi^2 <= 2 gamma^2 N_pix."""
     rms = random_equations(9).rms
-    assert "residual at noise level" in greedy(noise_rms=1.001 * rms / np.sqrt(2)).stop_reason
+    found = greedy(noise_rms=1.001 * rms / np.sqrt(2))
+    assert "residual at noise level" in found.stop_reason
+    assert found.stop is Stop.NOISE_LEVEL
     assert len(greedy(noise_rms=0.999 * rms / np.sqrt(2)).temporal) > 0
 
 
@@ -338,6 +344,7 @@ def test_pgd_stops_where_no_mode_helps():
         **ONE_PASS,
     )
     assert "no further mode lowers the residual" in found.stop_reason
+    assert found.stop is Stop.NO_GAIN
     assert not found.coefficients.any()
     assert found.temporal.shape == (0, 9)
 
@@ -352,6 +359,7 @@ def test_gauss_newton_stops_at_the_most_passes():
         least_change_voxel=1e-9,
     )
     assert "1 passes done, the most allowed: allow more" in found.stop_reason
+    assert found.stop is Stop.UNFINISHED
 
 
 def test_gauss_newton_stops_where_no_step_helps():
@@ -364,6 +372,7 @@ def test_gauss_newton_stops_where_no_step_helps():
         least_change_voxel=1e-9,
     )
     assert "no step lowers the residual further" in found.stop_reason
+    assert found.stop is Stop.NO_GAIN
 
 
 def test_amplitudes_count_in_voxels_of_scale_1_at_any_scale():

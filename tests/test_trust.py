@@ -140,7 +140,7 @@ def test_a_page_without_truth_has_no_table_but_the_sentences(tmp_path, case):
     measurement, _, _ = case
     text = write_report(tmp_path, replace(measurement, residual_tests=AS_NOISE)).read_text()
     assert 'id="trust"' not in text
-    verdict = text.partition('<ul id="verdict">')[2].partition("</ul>")[0]
+    verdict = text.partition('<ul id="deviations">')[2].partition("</ul>")[0]
     assert verdict.count("<li>") == 3
     assert 'id="uncertainty_histories"' in text
     assert 'id="uncertainty_maps"' in text

@@ -30,11 +30,12 @@ from pdvc.history import time_basis
 from pdvc.measurement import step_covariance, strain_std, turned_std
 from pdvc.noise import separate
 from pdvc.options import MeasureOptions, resolved
-from pdvc.preparation import bases, calibrated, noise_of, prepare, used_window
+from pdvc.preparation import bases, calibrated, noise_of, prepare
 from pdvc.prior import solved
 from pdvc.progress import Progress, silent
 from pdvc.sections import SectionBasis
 from pdvc.store import Store
+from pdvc.window import used_window
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
 from simulator.truth import read_truth
@@ -112,9 +113,9 @@ def bound_of(
 def _bound(experiment: Experiment, truth: TruePoints, options: MeasureOptions, progress: Progress) -> Bound:
     """Return the bound from an experiment whose counts are free of the noise that its description tells of."""
     options = resolved(options, experiment.geometry)
-    window = used_window(experiment.geometry, options)
     store = Store(None, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)
+    window = used_window(experiment.geometry, options, outline.hull)
     time_functions = time_basis(options.time, experiment.test)
     _, basis = bases(experiment.geometry, window, outline.hull, options)
     prepared = prepare(experiment, calibration, outline, window, 1, options, store, progress)

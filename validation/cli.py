@@ -12,6 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     from pdvc.measure import MeasureOptions
+    from pdvc.measurement import Measurement
     from simulator.truth import Truth
     from validation.console import ProgressBars
 
@@ -135,6 +136,40 @@ def simulate(
 
 
 @app.command()
+def inspect(
+    experiment: ExperimentFolder,
+    options: Options = "default",
+    picture: Annotated[Path, typer.Option("-o", "--out", metavar="PNG", help="Where the picture goes.")] = Path(
+        "inspection.png"
+    ),
+    threads: Threads = None,
+) -> None:
+    """Look at a folder before it is measured: counts, air, angles, onset of loading, what to change.
+
+    Example:  `pdvc-bench inspect out/quick/experiment`
+    """
+    with _answering() as progress:
+        from pdvc.experiment import read_experiment
+        from validation.inspection import inspect as look
+        from validation.inspection import lines_of
+        from validation.inspection_figure import inspection_figure
+
+        chosen, opened = _read_options(options), read_experiment(experiment)
+        _use_threads(threads)
+        found = look(opened, chosen, progress=progress)
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        inspection_figure(found, opened).savefig(picture, dpi=120)
+    from rich.console import Console
+
+    from validation.console import inspection_table, say_doubts
+
+    console = Console()
+    console.print(inspection_table(str(experiment), lines_of(found, opened)))
+    say_doubts(console, found.doubts)
+    _tell(f"picture: {picture}")
+
+
+@app.command()
 def measure(
     experiment: ExperimentFolder,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The measurement to write (NetCDF).")],
@@ -151,19 +186,23 @@ def measure(
 ) -> None:
     """Measure the motion of the sample at every load step, from the radiographs alone.
 
-    The folder may come from simulate or from a laboratory; the truth, if there is one, is not looked at.
+    The folder may come from simulate or from a laboratory; the truth, if there is one, is not looked at. The last line
+    is a verdict: trusted, doubtful or failed, with what speaks against the measurement. Exit code 3 says failed.
 
     Example:  `pdvc-bench measure out/quick/experiment -o motion.nc`
     """
     with _answering() as progress:
         from pdvc.experiment import read_experiment
+        from validation.console import used
         from validation.measuring import measure_into
 
         chosen = _read_options(options)
         opened = read_experiment(experiment)
         _use_threads(threads)
-        measure_into(out, opened, chosen, work=work, progress=progress)
+        found = measure_into(out, opened, chosen, work=work, progress=progress)
+    _tell(used(found))
     _tell(f"measurement: {out}")
+    _judge(found)
 
 
 @app.command()
@@ -265,6 +304,7 @@ def run(
         _tell(f"{part}: finished before, kept")
     Console().print(summary(outcome.scores))
     _tell(f"report: {outcome.report}")
+    _judge(outcome.measurement)
 
 
 @app.command()
@@ -358,6 +398,7 @@ def study(
     """
     with _answering(resume="give the same command again to go on from here") as progress:
         from pdvc.lock import held
+        from validation.paired import counted
         from validation.runs import run_trials
         from validation.study import Study, study_file, trials_of
         from validation.study_report import machine, write_study_report
@@ -380,6 +421,9 @@ def study(
     failed = int((table["status"] != "done").sum())
     if failed:
         _tell(f"{failed} of {len(table)} runs failed: see the reasons in {page}, or {out / 'failed'}")
+    doubted = int((table["verdict"].dropna() != "trusted").sum())
+    if doubted:
+        _tell(f"{doubted} of {len(table)} measurements are doubted: {counted(table['doubts'].dropna())}")
     _tell(f"report: {page}")
 
 
@@ -417,6 +461,17 @@ def plan(
     console.print(weak_table(found))
     if out is not None:
         _tell(f"table: {out}")
+
+
+def _judge(measurement: Measurement) -> None:
+    """Print a verdict on stderr; end with exit code 3 where the measurement failed."""
+    from rich.console import Console
+
+    from validation.console import NOT_BELIEVED, say_verdict
+
+    say_verdict(Console(stderr=True), measurement.verdict)
+    if measurement.verdict.word == "failed":
+        raise typer.Exit(NOT_BELIEVED)
 
 
 def _read_truth(folder: Path) -> Truth:

@@ -48,6 +48,7 @@ class Chapter:
     gain: TextTable | None
     verdict: str
     failures: tuple[tuple[str, str], ...]
+    doubts: tuple[tuple[str, str], ...]
     """Method and reason."""
     pictures: tuple[Picture, ...]
 
@@ -103,6 +104,9 @@ def _chapter(figures: Path, scenario: Scenario, methods: Sequence[Method], summa
         gain=gain,
         verdict=verdict,
         failures=tuple((each.method, each.reason) for each in scores if each.failed),
+        doubts=tuple(
+            (each.method, f"{each.doubted} of {each.done}: {each.doubts}") for each in scores if each.doubted
+        ),
         pictures=tuple(_pictures(figures, scenario.name, methods, summary)),
     )
 

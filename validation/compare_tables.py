@@ -59,6 +59,8 @@ def method_row(scores: MethodScores) -> Row:
         "repetitions": scores.done,
         "failed": scores.failed,
         "reason": scores.reason,
+        "doubted": scores.doubted,
+        "doubts": scores.doubts,
         "steps": scores.steps,
         "steps_measured": scores.measured,
         "steps_common": scores.common,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -24,17 +25,21 @@ from rich.progress import (
 from rich.table import Table
 
 from pdvc.lock import FULL_DISK
+from pdvc.verdict import Doubt, Verdict
 from validation.scores import Scores
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from pdvc.measurement import Measurement
     from simulator.scenario import Scenario
     from validation.study import Study
 
 INTERRUPTED = 130
 WRONG_INPUT = 2
 FAILED = 1
+NOT_BELIEVED = 3
+"""A measurement was made and written, but its verdict is `failed`."""
 
 
 class ProgressBars:
@@ -128,6 +133,43 @@ def _say(console: Console, text: str) -> None:
     console.print(
         text, style="red" if text.startswith("error") else None, markup=False, highlight=False, soft_wrap=True
     )
+
+
+def used(measurement: Measurement) -> str:
+    """Return in one line which part of the radiographs was used, and where loading begins."""
+    top, bottom, left, right = measurement.window
+    starts = re.findall(r"^start = (\d+)", measurement.options, re.MULTILINE)
+    onset = f"; loading begins after step {', '.join(dict.fromkeys(starts))}" if starts else ""
+    return f"used: rows {top} to {bottom - 1}, columns {left} to {right - 1}{onset}"
+
+
+def inspection_table(title: str, lines: Iterable[tuple[str, str, str]]) -> Table:
+    """Return what an inspection found as a table of one screen."""
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in ("", "found", "due"):
+        table.add_column(name)
+    for line in lines:
+        table.add_row(*line)
+    return table
+
+
+def say_doubts(console: Console, doubts: Sequence[Doubt]) -> None:
+    """Print what speaks against the data, and what to change; or that nothing does."""
+    if not doubts:
+        console.print("nothing speaks against these data", style="green")
+    for doubt in doubts:
+        style = "red" if doubt.fatal else "yellow"
+        console.print(str(doubt), style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def say_verdict(console: Console, verdict: Verdict) -> None:
+    """Print the word of a verdict, and a line for each doubt."""
+    console.print(f"verdict: {verdict.word}", style=_COLOURS[verdict.word], highlight=False)
+    for doubt in verdict.doubts:
+        console.print(f"  {doubt}", markup=False, highlight=False, soft_wrap=True)
+
+
+_COLOURS = {"trusted": "green", "doubtful": "yellow", "failed": "red"}
 
 
 def summary(scores: Scores, report: Path | None = None) -> Table:

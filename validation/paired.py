@@ -8,7 +8,8 @@ measured in that repetition, and differences are taken between the same repetiti
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -98,6 +99,10 @@ class MethodScores:
     failed: int
     reason: str
     """Why the first one failed, if any."""
+    doubted: int
+    """Repetitions whose own verdict is not `trusted`."""
+    doubts: str
+    """What speaks against them, and how often."""
     steps: int
     """Steps of the test."""
     measured: int
@@ -231,6 +236,8 @@ def _scores(scenario: str, method: str, group: _Group) -> MethodScores:
         done=len(done),
         failed=len(failed),
         reason=str(failed[0]["reason"]) if failed else "",
+        doubted=sum(row["verdict"] != "trusted" for row in done),
+        doubts=counted(str(row["doubts"]) for row in done),
         steps=int(middle("steps")),
         measured=int(middle("steps_measured")),
         common=group.common_steps,
@@ -242,6 +249,12 @@ def _scores(scenario: str, method: str, group: _Group) -> MethodScores:
         error=_estimates([group.common(method, each) for each in repetitions], rms),
         own_error=_estimates([group.own(method, each) for each in repetitions], rms),
     )
+
+
+def counted(doubts: Iterable[str]) -> str:
+    """Return how often each name occurs in lists of names, as text: ``cut-ends 3, strain 1``."""
+    found = Counter(name for each in doubts for name in each.split(", ") if name)
+    return ", ".join(f"{name} {count}" for name, count in found.most_common())
 
 
 def _difference(scenario: str, method: str, other: str, group: _Group) -> Difference:

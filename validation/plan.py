@@ -34,7 +34,7 @@ from pdvc.history import TimeFunctions, time_basis
 from pdvc.measurement import directions
 from pdvc.noise import Pile, product
 from pdvc.options import MeasureOptions, resolved
-from pdvc.preparation import bases, calibrated, noise_of, prepare, used_window
+from pdvc.preparation import bases, calibrated, noise_of, prepare
 from pdvc.progress import Progress, silent
 from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import noise_overlap, smoothed
@@ -42,6 +42,7 @@ from pdvc.rays import ray_vectors
 from pdvc.sections import SectionBasis
 from pdvc.store import Store
 from pdvc.uncertainty import sandwich
+from pdvc.window import used_window
 from simulator.scanner import simulate
 from simulator.scenario import Course, Scenario, course_of
 from simulator.truth import truth_points
@@ -172,10 +173,10 @@ class _Views:
         )
         self.reference_rad = experiment.reference.angle_rad
         self._geometry = experiment.geometry
-        self._window = used_window(experiment.geometry, self.options)
         store = Store(None, experiment)
         calibration, outline = calibrated(experiment, self.options, store, progress)
         self._hull = outline.hull
+        self._window = used_window(experiment.geometry, self.options, outline.hull)
         prepared = prepare(experiment, calibration, outline, self._window, 1, self.options, store, progress)
         noise = noise_of(experiment, calibration, prepared, self.options.smooth_px)
         assert noise is not None, "a scenario tells its noise"
@@ -323,6 +324,8 @@ def _stretched(parts: tuple[TimeFunctions, ...], share: float) -> tuple[TimeFunc
     result = []
     for part in parts:
         steps = {name: getattr(part, name) for name in ("start", "period") if hasattr(part, name)}
+        # an onset is found in the force, wherever it is
+        steps = {name: value for name, value in steps.items() if value != "onset"}
         stretched = {name: type(value)(round(value * share)) for name, value in steps.items()}
         result.append(part.model_copy(update=stretched))
     return tuple(result)

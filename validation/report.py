@@ -12,11 +12,20 @@ import numpy as np
 
 from pdvc.experiment import Experiment
 from pdvc.measurement import Measurement
+from pdvc.verdict import listed
 from validation.axis import TruePoints, axis_history, nan_mean
 from validation.noise_floor import LEAST_STEPS, NoiseFloor, noise_floor
 from validation.pictures import of_volumes, pictures
 from validation.scores import Directions, Scores, mean_snr, modes_found
 from validation.trust import calibration_sentences, nees_sentence, noise_known, residual_sentences, trust_table
+
+BELIEVED = {
+    "trusted": "Nothing that was checked in the data, the residual or the motion speaks against the measured motion. "
+    "How far its standard deviations may be relied on is another question: see below.",
+    "doubtful": "The motion may be right; look at each of these before it is used.",
+    "failed": "Nothing below is to be believed.",
+}
+"""What each word of a verdict means to a reader."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +80,9 @@ def _page(
         volumes=of_volumes(measurement),
         measured=int(np.isfinite(measurement.amplitude).any(axis=(1, 2)).sum()),
         scores=scores,
+        verdict=measurement.verdict,
+        listed=listed,
+        believed=BELIEVED[measurement.verdict.word],
         rows=summary_rows(measurement, scores),
         errors=_error_table(scores, measurement.voxel_mm * 1e3) if scores else [],
         trust=trust_table(scores) if scores else [],

@@ -89,6 +89,7 @@ class State:
 class Outcome:
     """Hold what a run came to."""
 
+    measurement: Measurement
     scores: Scores
     report: Path
     reused: tuple[str, ...]
@@ -129,7 +130,7 @@ def _run(job: Job, progress: Progress) -> Outcome:
     write_text(job.folder / "scores.json", scores.to_json())
     report = write_report(job.folder, measurement, experiment=experiment, truth=truth, scores=scores)
     progress("score and report", 1, 1)
-    return Outcome(scores=scores, report=report, reused=tuple(reused))
+    return Outcome(measurement=measurement, scores=scores, report=report, reused=tuple(reused))
 
 
 def _simulate(job: Job, state: State, state_path: Path, progress: Progress) -> bool:

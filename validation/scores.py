@@ -93,6 +93,10 @@ class Scores:
     """material points scored in at least one step"""
     points_left_out: int
     """material points never scored: outside the observed sections, or shared by an unobserved one"""
+    verdict: str
+    """trusted, doubtful or failed: what the measurement says of itself, without the truth"""
+    doubts: str
+    """names of what speaks against it, separated by commas"""
     seconds: Seconds
     peak_memory_gib: float
     """largest memory of the process that computed, GiB; NaN where nobody noted it"""
@@ -176,6 +180,8 @@ def score(
         max_strain_measured=_largest(measured),
         points_scored=int(scored.sum()),
         points_left_out=int((~scored).sum()),
+        verdict=measurement.verdict.word,
+        doubts=", ".join(measurement.verdict.names),
         seconds=Seconds(
             simulate=simulate_s,
             reconstruct=measurement.seconds.get("reconstruct", math.nan),

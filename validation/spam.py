@@ -35,13 +35,15 @@ from pdvc.history import Steps, time_basis
 from pdvc.measure import versions
 from pdvc.measurement import Measurement, Stage
 from pdvc.options import MeasureOptions, resolved
-from pdvc.preparation import bases, calibrated, outlined, scan_volume, used_window
+from pdvc.preparation import bases, calibrated, outlined, scan_volume
 from pdvc.prior import solved
 from pdvc.progress import silent
 from pdvc.radiographs import IDENTITY
 from pdvc.sections import SectionBasis
 from pdvc.store import Store
+from pdvc.verdict import Stop
 from pdvc.volume import Grid, Volume
+from pdvc.window import used_window
 from validation.methods import MethodError, looks_at_volumes
 
 Floats = NDArray[np.float64]
@@ -102,8 +104,7 @@ def spam(experiment: Experiment) -> Measurement:
         raise ValueError("interrupted scans: expected at least one, found none: spam compares full scans")
     started = time.perf_counter()
     options = resolved(MeasureOptions(), experiment.geometry)
-    window = used_window(experiment.geometry, options)
-    reference, volumes, basis = _volumes(experiment, options, window)
+    reference, volumes, window, basis = _volumes(experiment, options)
     correlating = time.perf_counter()
     spacing_mm = float(np.diff(basis.height_mm).min())
     spacing = min(SPACING_VOXEL, max(int(spacing_mm / reference.grid.voxel_mm / 2), 1))
@@ -155,6 +156,7 @@ def spam(experiment: Experiment) -> Measurement:
                 temporal=np.empty((0, len(unknown))),
                 spatial=np.empty((0, *basis.shape)),
                 rms=np.empty(0),
+                stop=Stop.UNFINISHED if any("did not converge" in each for each in told) else Stop.CONVERGED,
                 stop_reason="; ".join(told),
             ),
         ),
@@ -176,9 +178,12 @@ spam.check = check  # type: ignore[attr-defined]
 
 
 def _volumes(
-    experiment: Experiment, options: MeasureOptions, window: tuple[int, int, int, int]
-) -> tuple[Volume, list[Volume], SectionBasis]:
-    """Return the volumes of the reference and the interrupted scans, as `classical-dvc` has them, and its sections."""
+    experiment: Experiment, options: MeasureOptions
+) -> tuple[Volume, list[Volume], tuple[int, int, int, int], SectionBasis]:
+    """Return the volumes of the reference and the interrupted scans, the used window and the sections.
+
+    All are those that `classical-dvc` has.
+    """
     geometry, store = experiment.geometry, Store(None, experiment)
     calibration, outline = calibrated(experiment, options, store, silent)
     plain, polynomial = calibration.with_polynomial(IDENTITY), calibration.polynomial
@@ -188,7 +193,8 @@ def _volumes(
     for scan in experiment.interrupted:
         hull = outlined(scan.series, geometry, plain, polynomial, _made, silent).hull
         volumes.append(scan_volume(scan.series, geometry, calibration, hull, 1, 0.0, _made, silent))
-    return reference, volumes, bases(geometry, window, outline.hull, options)[1]
+    window = used_window(geometry, options, outline.hull)
+    return reference, volumes, window, bases(geometry, window, outline.hull, options)[1]
 
 
 def _made(make):  # type: ignore[no-untyped-def]

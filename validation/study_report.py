@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from validation.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
+from validation.paired import counted
 from validation.runs import FAILED
 from validation.study import Study
 from validation.study_figures import study_pictures
@@ -90,6 +91,8 @@ def _page(
         runs=len(table),
         failed=[[_cell(row[name]) for name in columns] for _, row in failed.iterrows()],
         failed_columns=columns,
+        doubted=int((table["verdict"].dropna() != "trusted").sum()),
+        doubts=counted(table["doubts"].dropna()),
         failed_folder=FAILED,
         factors=[factor.axis_label for factor in study.factor],
         parts=PARTS,

@@ -1,0 +1,190 @@
+"""Look at an experiment folder before anything is measured: what was found, what is proposed, what it will take."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import psutil
+
+from pdvc.compilation import compile_kernels
+from pdvc.data_checks import check_usable, doubts_of_data, doubts_of_time
+from pdvc.examination import Examination, examine, with_angles
+from pdvc.experiment import REFERENCE, TEST, Experiment
+from pdvc.history import time_basis, with_onset
+from pdvc.options import MeasureOptions, StageOptions, resolved
+from pdvc.preparation import bases, calibrated
+from pdvc.progress import Progress, silent
+from pdvc.projection import normal_equations
+from pdvc.rays import ray_vectors
+from pdvc.sections import SectionBasis
+from pdvc.store import Store
+from pdvc.verdict import Doubt
+from pdvc.volume import Hull, Volume
+from pdvc.window import scan_grid, used_window
+
+Line = tuple[str, str, str]
+"""What was looked at, what was found, and what is due or where it comes from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cost:
+    """Hold what a measurement is expected to take on this machine, to about a factor of two."""
+
+    seconds: float
+    memory_gib: float
+    unknowns: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspection:
+    """Hold what a folder holds, and what measuring it with the given options would do."""
+
+    found: Examination
+    window: tuple[int, int, int, int]
+    """Proposed rows and columns: row_from, row_to, column_from, column_to."""
+    cost: Cost
+    doubts: tuple[Doubt, ...]
+
+
+def inspect(experiment: Experiment, options: MeasureOptions, *, progress: Progress = silent) -> Inspection:
+    """Examine an experiment, outline the sample coarsely, and work out window and cost.
+
+    Raises ValueError, in one line, where the data cannot be used.
+    """
+    found = examine(experiment, progress=progress)
+    check_usable(found, experiment)
+    found = with_angles(found, experiment, progress=progress)
+    options = resolved(options, experiment.geometry)
+    options = options.model_copy(update={"time": with_onset(options.time, experiment.test)})
+    started = time.perf_counter()
+    outline = calibrated(experiment, options, Store(None, experiment), progress)[1]
+    outlining = time.perf_counter() - started
+    window = used_window(experiment.geometry, options, outline.hull)
+    basis = bases(experiment.geometry, window, outline.hull, options)[1]
+    return Inspection(
+        found=found,
+        window=window,
+        cost=_cost(experiment, options, window, outline.hull, basis, outlining, progress),
+        doubts=(*doubts_of_data(found, experiment), *doubts_of_time(options.time, experiment.test)),
+    )
+
+
+def _cost(
+    experiment: Experiment,
+    options: MeasureOptions,
+    window: tuple[int, int, int, int],
+    hull: Hull,
+    basis: SectionBasis,
+    outlining_s: float,
+    progress: Progress,
+) -> Cost:
+    """Time one radiograph on a volume as large as that of scale 1, and count passes, voxels and pixels."""
+    geometry, steps = experiment.geometry, len(experiment.test)
+    compile_kernels(progress=progress)
+    grid = scan_grid(geometry, hull)
+    volume = Volume(values=np.ones(grid.shape, dtype=np.float32), grid=grid, hull=hull)
+    rays = ray_vectors(geometry.cropped(*window), experiment.test.angle_rad[:1]).stacked()
+    target = np.zeros((1, window[1] - window[0], window[3] - window[2]), dtype=np.float32)
+    started = time.perf_counter()
+    normal_equations(
+        volume, rays, basis, np.zeros((1, *basis.shape)), target, np.ones_like(target), voxel_mm=grid.voxel_mm
+    )
+    pass_s = steps * (time.perf_counter() - started)
+    # two residual fields, and what propagating the noise takes
+    passes = sum(_passes(stage) for stage in (*options.rigid, *options.deformation)) + 3
+    voxels, reference = float(np.prod(grid.shape)), experiment.reference.counts
+    # the outline took two coarse reconstructions of some 150 views; scale 1 has more of both
+    rows = min(geometry.rows, 240)
+    finer = (geometry.rows / rows) ** 3 * len(reference) / min(len(reference), 150)
+    unknowns = len(time_basis(options.time, experiment.test)) * basis.shape[0] * basis.shape[1]
+    size = basis.shape[0] * basis.shape[1]
+    pixels = float(geometry.rows * geometry.columns)
+    memory = 8 * voxels + 4 * pixels * len(reference) / 2 + 24 * steps * target.size
+    memory += 8 * (2 * steps * size**2 + 10 * unknowns**2)
+    return Cost(
+        seconds=pass_s * passes + outlining_s * (1 + finer / 2), memory_gib=memory / 2**30 + 0.3, unknowns=unknowns
+    )
+
+
+def _passes(stage: StageOptions) -> float:
+    """Return how many passes of scale 1 a stage may take: at a coarser scale rays are fewer and shorter."""
+    assert isinstance(stage.scale, int), "options are resolved"
+    each = stage.passes_per_mode if stage.solver == "pgd" else 1
+    return (stage.most * each * 0.6 + 1) / stage.scale**2
+
+
+def lines_of(inspection: Inspection, experiment: Experiment) -> list[Line]:
+    """Return what to print: a line for each thing that was looked at."""
+    found, geometry = inspection.found, experiment.geometry
+    reference, test = found.stacks[REFERENCE], found.stacks[TEST]
+    lines: list[Line] = [
+        ("radiographs", f"{len(experiment.reference)} reference views, {len(experiment.test)} steps", ""),
+        ("detector", f"{geometry.rows} x {geometry.columns} px; a voxel is {geometry.voxel_mm * 1e3:.4g} um", ""),
+        (
+            "counts, reference",
+            f"{reference.lowest} to {reference.highest}, median {reference.median:.0f}",
+            f"{len(experiment.flats)} flats, {len(experiment.darks)} darks",
+        ),
+        ("counts, test", f"{test.lowest} to {test.highest}, median {test.median:.0f}", ""),
+        ("transmission of air", f"{_range(reference.air)} reference, {_range(test.air)} test", "1"),
+        ("pixels at the largest count", f"{max(reference.at_top.max(), test.at_top.max()):.2%}", "next to none"),
+        ("bad pixels", f"{found.bad_share:.2%}", "few"),
+        ("variance between flats / stated", _number(found.noise_ratio), "1; —: not stated, or one flat"),
+        ("largest gap of reference angles", f"{np.rad2deg(found.largest_gap_rad):.2f} degrees", "a few"),
+    ]
+    twice = found.seen_twice
+    if twice is not None:
+        lines += [
+            (
+                "fan angle seen / stated",
+                f"{twice.factor:.2f} +- {twice.factor_std:.2f} (mismatch {twice.mismatch:.2g}; "
+                f"{twice.mismatch_reversed:.2g} turning the other way)",
+                "1; -1: the stage turned the other way",
+            ),
+            ("axis off the stated column", f"{twice.axis_px:+.2f} px", "0"),
+            ("source off the stated row", f"{_signed(twice.plane_px)} px", "0, within a few"),
+        ]
+    like = found.likeness
+    if like is not None:
+        off = np.rad2deg(np.median(np.abs(like.off_rad)))
+        lines += [
+            (
+                "test like reference",
+                f"correlation {np.median(like.recorded):.2f} at the recorded angles, lowest {like.recorded.min():.2f}",
+                "near 1",
+            ),
+            (
+                "angle most like, less recorded",
+                f"{off:.1f} degrees, median",
+                f"under {np.rad2deg(like.spacing_rad):.0f}",
+            ),
+        ]
+    top, bottom, left, right = inspection.window
+    cost, free = inspection.cost, psutil.virtual_memory().available / 2**30
+    return [
+        *lines,
+        ("loading begins after step", "not found" if found.onset is None else str(found.onset), "from the force"),
+        ("window proposed", f"discard_rows = {top}, discard_columns = {left}", f"rows {top} to {bottom - 1}, "
+         f"columns {left} to {right - 1}"),
+        ("unknowns", str(cost.unknowns), ""),
+        ("time to expect", _duration(cost.seconds), "on this machine as busy as now, to a factor of two"),
+        ("memory to expect", f"{cost.memory_gib:.1f} GiB", f"{free:.1f} GiB free"),
+    ]  # fmt: skip
+
+
+def _range(values: np.ndarray) -> str:
+    return f"{values.min():.3f} to {values.max():.3f}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "—"
+
+
+def _signed(value: float | None) -> str:
+    return "—" if value is None else f"{value:+.1f}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
