@@ -50,6 +50,7 @@ bench: .venv-bench/.installed
 .PHONY: bad-inputs
 bad-inputs: $(VENV)/.installed
 	$(BIN)/python -m benchmarks.bad_inputs
+
 # every law of the tests on EXAMPLES examples, those through the whole pipeline on a tenth; tells how many were tried
 .PHONY: laws
 EXAMPLES ?= 300

@@ -61,14 +61,15 @@ def _check_stack(name: str, look: StackLook) -> None:
     if look.lowest == look.highest:
         raise ExperimentError(f"{name}: expected radiographs, found {look.highest} counts in every pixel")
     for shares, least, what, advice in (
-        (look.black, 0.9, "is black", "leave the image and its entries out"),
-        (look.at_top, 0.5, "is saturated", "leave the image and its entries out"),
-        (look.bright, 0.2, "is brighter than the open beam", "are these raw counts, and flats of the same exposure?"),
+        (look.black, 0.9, "black", "leave these images and their entries out"),
+        (look.at_top, 0.5, "saturated", "leave these images and their entries out"),
+        (look.bright, 0.2, "brighter than the open beam", "are these raw counts, and flats of the same exposure?"),
     ):
         found = np.flatnonzero(shares > least)
         if len(found):
             raise ExperimentError(
-                f"{name}: image {listed(found)} {what} in {shares[found[0]]:.0%} of its pixels: {advice}"
+                f"{name}: expected a sample in the open beam, found {shares[found[0]]:.0%} of the pixels {what} in "
+                f"image {listed(found)}: {advice}"
             )
     off = np.abs(look.air - 1) > AIR_ERROR
     if off.any():

@@ -35,7 +35,7 @@ from pdvc.sections import SectionBasis
 from pdvc.solution import Solution
 from pdvc.store import Store
 from pdvc.uncertainty import posterior
-from pdvc.verdict import Stop, Verdict
+from pdvc.verdict import Stop, Verdict, explained_by
 from pdvc.window import used_window
 
 __all__ = ["MeasureOptions", "StageOptions", "measure"]
@@ -60,6 +60,7 @@ def measure(
     examined = examine(experiment, progress=progress)
     check_usable(examined, experiment)
     examined = with_angles(examined, experiment, progress=progress)
+    doubts = (*doubts_of_data(examined, experiment), *doubts_of_time(options.time, experiment.test))
     store = Store(work, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)
     window = used_window(experiment.geometry, options, outline.hull)
@@ -74,13 +75,14 @@ def measure(
     fine = prepared[1]
     solving = time.perf_counter()
     solver = _Solver(prepared, time_functions, options, store, progress)
-    start = solver.run("rigid", rigid, options.rigid, np.zeros((len(time_functions), *rigid.shape)))
-    start = sections.rigid(start, rigid)
-    standing = np.zeros((len(experiment.test), *sections.shape))
-    initial = residuals(fine.images, sections, standing, progress=progress, task="initial residual")
-    moved = np.einsum("ft,fjk->tjk", time_functions, start)
-    after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
-    coefficients = solver.run("deformation", sections, options.deformation, start)
+    with explained_by(doubts):
+        start = solver.run("rigid", rigid, options.rigid, np.zeros((len(time_functions), *rigid.shape)))
+        start = sections.rigid(start, rigid)
+        standing = np.zeros((len(experiment.test), *sections.shape))
+        initial = residuals(fine.images, sections, standing, progress=progress, task="initial residual")
+        moved = np.einsum("ft,fjk->tjk", time_functions, start)
+        after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
+        coefficients = solver.run("deformation", sections, options.deformation, start)
     equations = solver.equations_at(sections, coefficients)
     amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
     propagating = time.perf_counter()
@@ -142,12 +144,8 @@ def measure(
         options=options.template(),
         versions=versions(),
     )
-    doubts = (
-        *doubts_of_data(examined, experiment),
-        *doubts_of_time(options.time, experiment.test),
-        *doubts_of_result(found, fine.images.volume, experiment.geometry, options.prior_voxel),
-    )
-    return replace(found, verdict=Verdict(doubts=doubts))
+    after = doubts_of_result(found, fine.images.volume, experiment.geometry, options.prior_voxel)
+    return replace(found, verdict=Verdict(doubts=(*doubts, *after)))
 
 
 def _on_the_axis(

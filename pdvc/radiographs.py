@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pdvc.experiment import Experiment
+from pdvc.experiment import FLATS, Experiment, ExperimentError
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -60,7 +60,7 @@ def calibrate(experiment: Experiment) -> Calibration:
     """Average flats and darks, and find the bad pixels in them.
 
     A pixel is bad where its open beam is under a tenth of the median, or where flat or dark stands out of its
-    3 x 3 neighbourhood by more than eight times the usual deviation. Raises ValueError where the flats
+    3 x 3 neighbourhood by more than eight times the usual deviation. Raises ExperimentError where the flats
     are not brighter than the darks.
     """
     dark: Floats = np.asarray(np.mean(experiment.darks, axis=0, dtype=np.float64))
@@ -68,7 +68,9 @@ def calibrate(experiment: Experiment) -> Calibration:
     open_beam = np.asarray(flat - dark)
     level = float(np.median(open_beam))
     if level <= 0:
-        raise ValueError(f"flats: expected more counts than the darks, found a median difference of {level:.0f}")
+        raise ExperimentError(
+            f"{FLATS}: expected more counts than the darks, found a median difference of {level:.0f}"
+        )
     bad = (open_beam < 0.1 * level) | _stands_out(flat) | _stands_out(dark)
     return Calibration(
         dark=np.asarray(dark, dtype=np.float32),

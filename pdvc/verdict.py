@@ -5,7 +5,8 @@ Also why each stage of it ended.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
@@ -74,6 +75,20 @@ class Verdict:
     def of_step(self, step: int) -> tuple[str, ...]:
         """Return the names of the doubts that concern this step by itself."""
         return tuple(dict.fromkeys(doubt.name for doubt in self.doubts if step in doubt.steps))
+
+
+class NotMeasuredError(ValueError):
+    """Say why nothing could be measured, and what spoke against the data before."""
+
+
+@contextmanager
+def explained_by(doubts: Sequence[Doubt]) -> Iterator[None]:
+    """Raise NotMeasuredError in place of a ValueError: what came of doubtful data is told with the doubts."""
+    try:
+        yield
+    except ValueError as error:
+        before = f"; what speaks against the data: {'; '.join(map(str, doubts))}" if doubts else ""
+        raise NotMeasuredError(f"{error}{before}") from error
 
 
 UNCHECKED = Verdict(

@@ -29,6 +29,8 @@ _PROGRESS = re.compile(r": \d+ of \d+ in [\d.]+ s$|^(measurement|report): ")
 _RAW = re.compile(r"^Traceback |:\d+: \w*Warning: ")
 _EXPLAINED = re.compile(r"expected|missing|unknown key|not valid TOML|truncated")
 """What every error of this software says: what was expected, or what is missing; and no dictionary of Python's."""
+MEASURED = (0, 3)
+"""Exit codes with which a result was written; 3: its verdict is `failed`."""
 LARGE_STRAIN = 0.2
 """A strain above this is no measurement of a metal: the table marks it."""
 
@@ -68,7 +70,7 @@ class Outcome:
     @property
     def answer(self) -> str:
         """Return ``error``, ``warning``, ``trusted`` or ``nothing``."""
-        if self.code != 0:
+        if self.code not in MEASURED:
             return "error" if self.errors else "nothing"
         return {"": "nothing", "trusted": "trusted"}.get(self.verdict, "warning")
 
@@ -83,7 +85,7 @@ def _faults(seen: Outcome) -> Iterator[str]:
     if seen.code is None:
         yield "NO END"
         return
-    if seen.code not in (0, 2) or (seen.code == 2 and not seen.errors):
+    if seen.code not in (*MEASURED, 2) or (seen.code == 2 and not seen.errors):
         yield f"CRASH, exit code {seen.code}"
     elif due == "good" and answer == "error":
         yield "REFUSED"
@@ -101,7 +103,7 @@ def _faults(seen: Outcome) -> Iterator[str]:
         yield "unclear error"
     if seen.left:
         yield f"leaves {', '.join(seen.left)}"
-    if seen.code == 0:
+    if seen.code in MEASURED:
         yield from _hidden(seen)
 
 
@@ -185,7 +187,7 @@ class Bench:
             else tuple(sorted(path.name for path in place.iterdir() if path.name not in known)),
             seconds=seconds,
         )
-        found = seen() if code != 0 or not result.is_file() else seen(**self._result(place))
+        found = seen() if code not in MEASURED or not result.is_file() else seen(**self._result(place))
         shutil.rmtree(place)
         return found
 

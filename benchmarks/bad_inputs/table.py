@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from benchmarks.bad_inputs.bench import LARGE_STRAIN, Outcome
+from benchmarks.bad_inputs.bench import LARGE_STRAIN, MEASURED, Outcome
 
 LONGEST = 150
 """Characters of an error that the table shows."""
@@ -71,7 +71,7 @@ def row(outcome: Outcome) -> list[str]:
 
 def said(outcome: Outcome) -> str:
     """Return the error, shortened, or the verdict and its reasons."""
-    if outcome.code != 0:
+    if outcome.code not in MEASURED:
         line = " / ".join(outcome.errors) or (outcome.console[-1] if outcome.console else "")
         return line if len(line) <= LONGEST else line[: LONGEST - 4] + " ..."
     reasons = ", ".join(f"{name} ({figure})" for name, figure, _ in outcome.doubts)
