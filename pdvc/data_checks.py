@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pdvc.examination import Examination, StackLook
+from pdvc.examination import Examination, StackLook, full_scale
 from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, Experiment, ExperimentError, Series
 from pdvc.history import Ramp, TimeFunctions
 from pdvc.verdict import Doubt, listed
@@ -36,13 +36,13 @@ ALIKE, ANOTHER = 0.1, 0.4
 
 def check_usable(found: Examination, experiment: Experiment) -> None:
     """Raise ExperimentError, in one line, where the counts cannot be those of an experiment."""
-    for name, look in found.stacks.items():
-        _check_stack(name, look)
-    if found.flats_top > 0.1:
+    if found.flats_top > 0.1 and found.flats_full:
         raise ExperimentError(
             f"{FLATS}: expected counts below saturation, found {found.flats_top:.0%} of the pixels at the largest "
             "count: expose shorter"
         )
+    for name, look in found.stacks.items():
+        _check_stack(name, look, clips=_clips(look.highest, found))
     if found.bad_share > 0.2:
         raise ExperimentError(
             f"{FLATS}: expected nearly all pixels alike, found {found.bad_share:.0%} bad ones: "
@@ -57,12 +57,20 @@ def check_usable(found: Examination, experiment: Experiment) -> None:
         )
 
 
-def _check_stack(name: str, look: StackLook) -> None:
+def _clips(highest: int, found: Examination) -> bool:
+    """Return whether many pixels at the largest count mean that counts are clipped.
+
+    Not where flats, too, hold one count in most pixels: a beam without noise on a detector without pattern.
+    """
+    return full_scale(highest) or found.flats_top < SATURATED
+
+
+def _check_stack(name: str, look: StackLook, *, clips: bool) -> None:
     if look.lowest == look.highest:
         raise ExperimentError(f"{name}: expected radiographs, found {look.highest} counts in every pixel")
     for shares, least, what, advice in (
         (look.black, 0.9, "black", "leave these images and their entries out"),
-        (look.at_top, 0.5, "saturated", "leave these images and their entries out"),
+        (look.at_top if clips else np.zeros(0), 0.5, "saturated", "leave these images and their entries out"),
         (look.bright, 0.2, "brighter than the open beam", "are these raw counts, and flats of the same exposure?"),
     ):
         found = np.flatnonzero(shares > least)
@@ -130,7 +138,7 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 advice="the beam changed, or flats and darks are not those of these radiographs",
                 steps=tuple(off.tolist()) if of_test else (),
             )
-        clipped = np.flatnonzero(look.at_top > SATURATED)
+        clipped = np.flatnonzero(look.at_top > SATURATED) if _clips(look.highest, found) else np.zeros(0, dtype=int)
         if len(clipped):
             yield Doubt(
                 name="saturation",
@@ -154,7 +162,7 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 advice="the whole width of the sample has to be seen at every angle",
                 steps=tuple(cut.tolist()) if of_test else (),
             )
-    if found.flats_top > SATURATED:
+    if found.flats_top > SATURATED and found.flats_full:
         yield Doubt(
             name="saturation",
             figure=f"{FLATS}: {found.flats_top:.1%} of the pixels are at the largest count",

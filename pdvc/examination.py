@@ -31,6 +31,8 @@ SHADE = 0.9
 """A transmission under this is behind a sample."""
 BRIGHT = 1.3
 """A transmission above this is brighter than any air."""
+CHANCE = 8
+"""Pixels of an image that may hold its largest count without it being clipped."""
 _PIXELS = 15_000
 """Pixels of an image that are looked at, about: rows are skipped in large ones."""
 
@@ -46,7 +48,7 @@ class StackLook:
     highest: int
     """Largest count of a pixel that is not bad."""
     at_top: Floats
-    """(image,) share of pixels at the largest count of the stack: next to nothing unless it saturates."""
+    """(image,) share of pixels at the largest count of the image: next to nothing unless it saturates."""
     air: Floats
     """(image,) transmission next to the left or the right edge, the larger of both medians."""
     black: Floats
@@ -68,6 +70,8 @@ class Examination:
     """By file name: test and reference radiographs."""
     flats_top: float
     """Share of pixels of the flats at their largest count."""
+    flats_full: bool
+    """Whether that is the largest count that a detector stores."""
     bad_share: float
     """Share of pixels that are not to be believed."""
     noise_ratio: float
@@ -75,7 +79,7 @@ class Examination:
     largest_gap_rad: float
     """Largest gap between neighbouring angles of the reference views, rad."""
     repeated: tuple[int, ...]
-    """Steps whose radiograph is the same, count for count, as that of an earlier step."""
+    """Steps whose radiograph is that of an earlier step, count for count; none where there is no noise."""
     onset: int | None
     """Step before the force leaves its plateau; None where it does not."""
     seen_twice: SeenTwice | None
@@ -102,10 +106,11 @@ def examine(experiment: Experiment, *, progress: Progress = silent) -> Examinati
         calibration=calibration,
         stacks=stacks,
         flats_top=float((experiment.flats == experiment.flats.max()).mean()),
+        flats_full=full_scale(int(experiment.flats.max())),
         bad_share=float(calibration.bad.mean()),
         noise_ratio=_noise_ratio(experiment, calibration),
         largest_gap_rad=float(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max()),
-        repeated=_repeated(experiment.test.counts),
+        repeated=_repeated(experiment),
         onset=onset(experiment.test.force_N),
         seen_twice=None,
         likeness=None,
@@ -129,7 +134,7 @@ def _look(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
     dark, beam, good = calibration.dark[some], calibration.open_beam[some], ~calibration.bad[some]
     width = max(2, round(columns * EDGE_SHARE))
     lows, medians, highs = [], [], []
-    found: dict[str, list[float]] = {name: [] for name in ("air", "black", "bright", "shaded", "edge")}
+    found: dict[str, list[float]] = {name: [] for name in ("at_top", "air", "black", "bright", "shaded", "edge")}
     for image in counts:
         part = np.asarray(image[some])
         seen = (part - dark) / beam
@@ -141,20 +146,21 @@ def _look(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
         found["air"].append(max(float(np.nanmedian(side)) for side in sides))
         found["edge"].append(max(float((side < SHADE * found["air"][-1]).mean()) for side in sides))
         inside = seen[good]
+        at_top = int((believed == highs[-1]).sum())
+        found["at_top"].append(at_top / believed.size if at_top >= CHANCE else 0.0)
         for name, chosen in (("black", inside < DARK), ("bright", inside > BRIGHT), ("shaded", inside < SHADE)):
             found[name].append(float(chosen.mean()))
-    top = max(highs)
-    at_top = [
-        float((image[some][good] == top).mean()) if high == top else 0.0
-        for image, high in zip(counts, highs, strict=True)
-    ]
     return StackLook(
         lowest=min(lows),
         median=float(np.median(medians)),
-        highest=top,
-        at_top=np.array(at_top),
+        highest=max(highs),
         **{name: np.array(values) for name, values in found.items()},
     )
+
+
+def full_scale(count: int) -> bool:
+    """Return whether a count is the largest that a detector of eight bits or more stores."""
+    return count >= 255 and (count + 1) & count == 0
 
 
 def _noise_ratio(experiment: Experiment, calibration: Calibration) -> float:
@@ -170,7 +176,10 @@ def _noise_ratio(experiment: Experiment, calibration: Calibration) -> float:
     return float(np.var(change) / (expected.mean() + 2 / 12))
 
 
-def _repeated(counts: NDArray[np.uint16]) -> tuple[int, ...]:
+def _repeated(experiment: Experiment) -> tuple[int, ...]:
+    flats, counts = experiment.flats, experiment.test.counts
+    if len(flats) > 1 and np.array_equal(flats[0], flats[1]):  # without noise the same state gives the same counts
+        return ()
     seen: set[bytes] = set()
     found = []
     for step, image in enumerate(counts):

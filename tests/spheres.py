@@ -48,9 +48,10 @@ def experiment(seed: int = 0, *, views: int = 48, steps: int = 12, beam: ConeBea
     The step angles go round once and a bit; the force leaves its plateau after a third of the steps.
     """
     spheres = sample(seed)
+    gain = OPEN * np.random.default_rng(1).uniform(0.97, 1.03, size=(beam.rows, beam.columns))
 
     def series(angle: np.ndarray) -> Series:
-        counts = DARK + OPEN * np.exp(-attenuation(beam, angle, spheres))
+        counts = DARK + gain * np.exp(-attenuation(beam, angle, spheres))
         step = np.arange(len(angle), dtype=float)
         return Series(
             counts=np.round(counts).astype(np.uint16),
@@ -69,7 +70,7 @@ def experiment(seed: int = 0, *, views: int = 48, steps: int = 12, beam: ConeBea
         readout_noise_counts=None,
         reference=series(2 * np.pi * np.arange(views) / views),
         test=series(2 * np.pi * np.arange(steps) / steps * 1.25),
-        flats=np.full((2, *shape), round(OPEN + DARK), dtype=np.uint16),
+        flats=np.round(np.stack([gain + DARK] * 2)).astype(np.uint16),
         darks=np.full((1, *shape), round(DARK), dtype=np.uint16),
     )
 
