@@ -20,6 +20,8 @@ AIR_ERROR, AIR_DOUBT = 0.3, 0.03
 """Departures of the air's transmission from 1 that are refused, and doubted."""
 SATURATED = 1e-3
 """Share of pixels at the largest count above which a stack is clipped: of ten thousand pixels one is chance."""
+STEEP, FLAT_SHARE = 0.65, 0.25
+"""Rise of attenuation within one column that a flat face along the beam makes; share of steps that may have it."""
 NOISE_FACTOR = 1.5
 """The variance between flats may differ by this factor from what the description says: flats are few, pixels many."""
 GAP_RAD = np.deg2rad(15.0)
@@ -153,6 +155,16 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 figure=f"{name}: up to {look.black.max():.1%} of the pixels see no more than 2 % of the beam",
                 advice="nothing is measured behind them: more photons, a harder beam or a thinner sample",
                 steps=tuple(dark.tolist()) if of_test else (),
+            )
+        flat = np.flatnonzero(look.steepest > STEEP)
+        if of_test and len(flat) > FLAT_SHARE * len(look.steepest):
+            yield Doubt(
+                name="flat-faces",
+                figure=f"{name}: at {len(flat)} of {len(look.steepest)} steps attenuation rises by more than "
+                f"{STEEP:.0%} of its largest from one column to the next",
+                advice="flat faces lie along the beam, where edges are interpolated badly: turn the sample, or use "
+                "other angles",
+                steps=tuple(flat.tolist()),
             )
         cut = np.flatnonzero(look.edge > 0.02)
         if len(cut):

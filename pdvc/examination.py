@@ -57,6 +57,8 @@ class StackLook:
     """(image,) share of pixels brighter than any air."""
     shaded: Floats
     """(image,) share of pixels behind the sample."""
+    steepest: Floats
+    """(image,) largest change from a column to the next, over the largest attenuation of its row; median over rows."""
     edge: Floats
     """(image,) share of rows that see the sample next to the left or the right edge."""
 
@@ -134,10 +136,12 @@ def _look(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
     dark, beam, good = calibration.dark[some], calibration.open_beam[some], ~calibration.bad[some]
     width = max(2, round(columns * EDGE_SHARE))
     lows, medians, highs = [], [], []
-    found: dict[str, list[float]] = {name: [] for name in ("at_top", "air", "black", "bright", "shaded", "edge")}
+    found: dict[str, list[float]] = {
+        name: [] for name in ("at_top", "air", "steepest", "black", "bright", "shaded", "edge")
+    }
     for image in counts:
         part = np.asarray(image[some])
-        seen = (part - dark) / beam
+        seen = np.asarray((part - dark) / beam, dtype=np.float64)
         sides = [np.nanmedian(np.where(good, seen, np.nan)[:, at], axis=1) for at in np.s_[:width, -width:]]
         believed = part[good]
         lows.append(int(believed.min()))
@@ -145,6 +149,7 @@ def _look(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
         medians.append(float(np.median(believed)))
         found["air"].append(max(float(np.nanmedian(side)) for side in sides))
         found["edge"].append(max(float((side < SHADE * found["air"][-1]).mean()) for side in sides))
+        found["steepest"].append(_steepest(seen))
         inside = seen[good]
         at_top = int((believed == highs[-1]).sum())
         found["at_top"].append(at_top / believed.size if at_top >= CHANCE else 0.0)
@@ -156,6 +161,13 @@ def _look(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
         highest=max(highs),
         **{name: np.array(values) for name, values in found.items()},
     )
+
+
+def _steepest(transmission: Floats) -> float:
+    """Return how steeply attenuation rises at the sample's edge: at once where a flat face lies along the beam."""
+    attenuation = -np.log(np.clip(transmission, 1e-3, None))
+    largest = np.maximum(attenuation.max(axis=1), 1e-3)
+    return float(np.median(np.abs(np.diff(attenuation, axis=1)).max(axis=1) / largest))
 
 
 def full_scale(count: int) -> bool:
