@@ -1,0 +1,103 @@
+"""What the commands of the command line have in common: arguments, progress, errors in one line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from pdvc.measurement import Measurement
+    from pdvc.options import MeasureOptions
+    from validation.console import ProgressBars
+
+ScenarioName = Annotated[
+    str, typer.Argument(metavar="SCENARIO", help="A built-in name (see: scenarios), or the path of a TOML file.")
+]
+ExperimentFolder = Annotated[
+    Path, typer.Argument(metavar="DIR", help="An experiment folder: experiment.toml and its TIFF stacks.")
+]
+MeasurementFile = Annotated[Path, typer.Argument(metavar="FILE", help="A measurement, as written by measure.")]
+Options = Annotated[
+    str,
+    typer.Option(
+        "--options",
+        metavar="NAME|TOML",
+        help="How to measure: a built-in protocol, default or paper, or a TOML file such as 'options' prints.",
+    ),
+]
+Threads = Annotated[
+    int | None,
+    typer.Option(
+        "--threads", min=1, metavar="N", help="Processor cores to use; all, unless given. Changes no result."
+    ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", min=1, metavar="N", help="Processes on this machine, one thread each; one for each processor."
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="A Dask scheduler to send the work to; its workers see DIR too."
+    ),
+]
+
+
+class Debugging:
+    """Hold whether errors are shown with their traceback: --debug."""
+
+    on = False
+
+
+def judge(measurement: Measurement) -> None:
+    """Print a verdict on stderr; end with exit code 3 where the measurement failed."""
+    from rich.console import Console
+
+    from validation.console import NOT_BELIEVED, say_verdict
+
+    say_verdict(Console(stderr=True), measurement.verdict)
+    if measurement.verdict.word == "failed":
+        raise typer.Exit(NOT_BELIEVED)
+
+
+def read_options(name: str) -> MeasureOptions:
+    """Return a built-in protocol by its name, or the options of a TOML file."""
+    from pdvc.options import PROTOCOLS, MeasureOptions
+
+    return PROTOCOLS[name]() if name in PROTOCOLS else MeasureOptions.read(Path(name))
+
+
+def use_threads(count: int | None) -> None:
+    """Let numba use so many threads; raises ValueError where the machine has fewer."""
+    if count is None:
+        return
+    import numba
+
+    most = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    if count > most:
+        raise ValueError(f"--threads: expected 1 to {most} on this machine, given {count}")
+    numba.set_num_threads(count)
+
+
+@contextmanager
+def answering(resume: str = "nothing half-written was left under its final name") -> Iterator[ProgressBars]:
+    """Show progress on stderr, and errors there in one line."""
+    from rich.console import Console
+
+    from validation.console import ProgressBars, one_line_errors
+
+    console = Console(stderr=True)
+    with one_line_errors(console, resume=resume, debug=Debugging.on), ProgressBars(console) as progress:
+        yield progress
+
+
+def tell(text: str) -> None:
+    """Print a line on stderr."""
+    print(text, file=sys.stderr)
