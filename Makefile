@@ -70,3 +70,10 @@ mutants: .venv-mutants/.installed
 	$(PYTHON) -m venv .venv-mutants
 	.venv-mutants/bin/pip install --quiet --disable-pip-version-check --editable '.[mutants]'
 	touch $@
+
+# kill commands at random moments and give them again; fuzz folders and TOML with fifty times the examples of the
+# tests. Some hours on 2 cores; docs/faults.md holds a result
+.PHONY: faults
+faults: $(VENV)/.installed-test
+	$(BIN)/python -m benchmarks.faults
+	FUZZ=50 $(BIN)/python -m pytest tests/test_fuzz.py

@@ -27,7 +27,7 @@ parallel and added in order, so that the result does not depend on the number of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit, prange
@@ -79,10 +79,10 @@ def normal_equations(
 
     `rays` (step, 4, 3) in mm as of RayVectors.stacked, for the window that `target` (step, row, column) covers;
     `amplitude` (step, section, motion) in voxels of `voxel_mm`; `weight` (step, row, column), or (1, row, column)
-    for all steps, zero for unused pixels. Raises ValueError for amplitudes that are not finite or of another shape,
-    or that take the sample out of the scanner.
+    for all steps, zero for unused pixels. A step that takes the sample out of the scanner has an infinite chi2, so
+    that no solver goes there. Raises ValueError for amplitudes that are not finite or of another shape.
     """
-    return _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, True)
+    return _walk(volume, rays, basis, amplitude, target, weight, voxel_mm, True, tried=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,10 +147,12 @@ def _walk(
     voxel_mm: float,
     with_sensitivities: bool,
     fields: list[Sensitivities] | None = None,
+    tried: bool = False,
 ) -> StepEquations:
     """Prepare the steps in index coordinates of the volume, walk their rays, and add the bands in order.
 
-    Where `fields` is a list, the sensitivities of each step are appended to it.
+    Where `fields` is a list, the sensitivities of each step are appended to it. Where motions are only `tried`, one
+    that leaves the scanner is as bad as can be; else it is refused.
     """
     grid, steps = volume.grid, len(rays)
     if amplitude.shape != (steps, *basis.shape) or not np.isfinite(amplitude).all():
@@ -164,7 +166,13 @@ def _walk(
     patterns = _indexed(basis.patterns(), origin, grid.voxel_mm) * ratio
     place, support = _hull_in_index(volume)
     boxes = np.stack([_moved_box(volume, heights, each) for each in maps])
-    _check_reach(boxes, index_rays, grid.voxel_mm)
+    astray = _astray(boxes, index_rays)
+    if astray.any():
+        if not tried:
+            raise ValueError(f"amplitude: expected the sample in the beam, got it outside in {astray.sum()} steps")
+        at_rest = np.where(astray[:, None, None], 0, amplitude)
+        found = _walk(volume, rays, basis, at_rest, target, weight, voxel_mm, with_sensitivities, tried=True)
+        return replace(found, chi2=np.where(astray, np.inf, found.chi2))
     bands = [_band_sections(index_rays[t], target.shape[1:], heights, boxes[t]) for t in range(steps)]
     low = np.stack([lowest for lowest, _ in bands])
     size = max(span for _, span in bands) * basis.shape[1] if with_sensitivities else 0
@@ -250,15 +258,10 @@ def _moved_box(volume: Volume, heights: Floats, maps: Floats) -> Floats:
     return box
 
 
-def _check_reach(boxes: Floats, rays: Floats, voxel_mm: float) -> None:
-    """Raise ValueError where a motion takes the sample so far that sums in single precision mean nothing."""
+def _astray(boxes: Floats, rays: Floats) -> NDArray[np.bool_]:
+    """Return which steps (step,) are taken so far that sums in single precision mean nothing."""
     most = _FARTHEST * float(np.linalg.norm(rays[:, 0], axis=1).max())
-    size = float(np.abs(boxes).max())
-    if not size <= most:
-        raise ValueError(
-            f"motion: expected the sample to stay in the beam, found it {size * voxel_mm:.3g} mm away: the test "
-            "radiographs do not show the scanned sample, or their angles or the scanner's distances are wrong"
-        )
+    return np.asarray(~(np.abs(boxes).max(axis=(1, 2)) <= most))
 
 
 def _band_sections(

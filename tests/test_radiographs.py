@@ -233,3 +233,11 @@ def test_filtered_noise_overlaps_with_its_neighbours_as_told(smooth_px):
     seen = [(noise * noise).mean(), (noise[:, 1:] * noise[:, :-1]).mean(), (noise[2:] * noise[:-2]).mean()]
     # 200 000 pixels, of which some ten are alike: known to half a per cent
     np.testing.assert_allclose(seen, [c0 * c0, c0 * c1, c0 * c2], atol=0.02 * c0 * c0)
+
+
+def test_images_without_contrast_have_an_snr_too():
+    used, flat = np.ones((3, 4), dtype=bool), np.full((3, 4), 0.3, dtype=np.float32)
+    ramp = np.arange(12, dtype=np.float32).reshape(3, 4)
+    assert snr_db(flat, flat, used) == 0
+    assert snr_db(ramp, flat, used) == pytest.approx(20 * np.log10(ramp.std() / 1e-7))
+    assert snr_db(flat, ramp, used) == pytest.approx(20 * np.log10(1e-7 / ramp.std()))
