@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 import tomlkit
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.bad_inputs.bench import Bench, Outcome
@@ -121,6 +121,7 @@ def measured(case, verdict):
     )
 
 
+@settings(deadline=None)
 @given(case=cases, verdict=answers)
 def test_a_result_is_answered_only_by_the_verdict_that_is_due(case, verdict):
     faults = measured(case, verdict).faults
@@ -135,11 +136,13 @@ def test_a_result_is_answered_only_by_the_verdict_that_is_due(case, verdict):
         assert faults == ("SILENT",)
 
 
+@settings(deadline=None)
 @given(case=cases)
 def test_an_error_is_an_answer_to_all_but_good_inputs(case):
     assert (not Outcome(case=case, code=2, console=(EXPECTED,)).faults) == (case.due != "good")
 
 
+@settings(deadline=None)
 @given(case=cases, code=st.sampled_from([0, 1, 2, -9, None]), verdict=answers)
 def test_what_is_not_meant_for_a_user_is_always_a_fault(case, code, verdict):
     seen = replace(measured(case, verdict), code=code)
