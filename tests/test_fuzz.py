@@ -272,7 +272,7 @@ def measured(folder, other):
     out.unlink(missing_ok=True)
     result = pdvc_bench("measure", other, "-o", out, "--options", folder / "few.toml")
     assert not out.with_name("m.nc.work").exists()
-    if result.exit_code == 0:
+    if result.exit_code in (0, 3):  # 3: measured, and called failed
         check_finite(read_measurement(out))
         return
     assert result.exit_code == 2, result.stderr

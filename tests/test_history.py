@@ -206,7 +206,7 @@ def test_a_power_of_zero_is_a_jump_at_the_start_and_a_negative_one_is_refused():
 
 
 def test_by_default_the_parts_are_those_of_table_1_and_the_period_is_the_paper_s_test():
-    assert (Force(), Angle(), Polynomial(), Ramp()) == PAPER
+    assert (Force(), Angle(), Polynomial(), Ramp(start=50)) == PAPER
     assert Fourier().functions(series()).shape == (6, 127)
     np.testing.assert_allclose(Fourier(harmonics=1).functions(series(128))[:, 127], [0, 1], atol=1e-12)
     assert Splines().functions(series()).shape == (9, 127)

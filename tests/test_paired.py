@@ -36,8 +36,18 @@ def lay_out(folder, runs):
         costs = {"radiographs": 67, "scanner_minutes": 2.5, "reference_radiographs": 60, "reference_minutes": 2.0}
         measured = int(errors.steps.sum())
         row |= {"status": "done", "reason": "", "steps": STEPS, "steps_measured": measured, "seconds_method": 3.0}
+        row |= {"verdict": "trusted", "doubts": ""}
         rows.append({**row, **costs})
     return rows
+
+
+def test_doubted_measurements_are_counted_by_their_reasons(tmp_path):
+    rows = lay_out(tmp_path, [("one", k, constant(1.0)) for k in range(3)] + [("other", 0, constant(1.0))])
+    rows[0] |= {"verdict": "doubtful", "doubts": "strain, cut-ends"}
+    rows[2] |= {"verdict": "failed", "doubts": "strain"}
+    one, other = summarised(rows, tmp_path).methods
+    assert (one.doubted, one.doubts) == (2, "strain 2, cut-ends 1")
+    assert (other.doubted, other.doubts) == (0, "")
 
 
 def test_a_method_with_few_steps_is_compared_where_it_measured(tmp_path):

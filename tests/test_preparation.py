@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pdvc.options import resolved
-from pdvc.preparation import calibrated, prepare, used_window
+from pdvc.preparation import calibrated, prepare
 from pdvc.progress import silent
 from pdvc.store import Store
+from pdvc.window import used_window
 from validation.small_cases import SmallExperiment, small_scenario
 
 SMALL = SmallExperiment(small_scenario({"detector.bad_pixel_fraction": 0.0}))
@@ -54,7 +55,7 @@ def test_a_coarse_pixel_counts_where_more_than_two_thirds_of_it_were_measured(sc
     store = Store(None, experiment)
     calibration, outline = calibrated(experiment, options, store, silent)
     assert calibration.bad.sum() == len(dead)
-    window = used_window(experiment.geometry, options)
+    window = used_window(experiment.geometry, options, outline.hull)
     weight = prepare(experiment, calibration, outline, window, scale, options, store, silent).images.weight[0]
     expected = np.ones_like(weight)
     expected[12 - window[0] // scale, 6 - window[2] // scale] = counts

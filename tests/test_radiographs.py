@@ -142,7 +142,7 @@ def test_bad_pixels_leave_no_trace_in_grey_levels():
 
 def test_flats_as_dark_as_the_darks_are_refused():
     with pytest.raises(
-        ValueError, match="flats: expected more counts than the darks, found a median difference of -1"
+        ValueError, match=r"flats.tif: expected more counts than the darks, found a median difference of -1"
     ):
         calibrate(experiment(np.full((1, ROWS, COLUMNS), 99), np.full((1, ROWS, COLUMNS), 100)))
 

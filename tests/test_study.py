@@ -260,7 +260,7 @@ class TestAWholeStudy:
         assert table["seconds"].min() > 0
         assert {path.name for path in out.iterdir()} == {
             *("runs", "errors", "failed", "figures", "table.parquet"),
-            *("summary.csv", "scores.csv", "coverage.csv", "study.html"),
+            *("summary.csv", "scores.csv", "coverage.csv", "study.html", ".in-use"),
         }
         assert len(list((out / "figures").iterdir())) == 2
         assert str(FACTORS.splitlines()[2]) in (out / "study.html").read_text().replace("&#34;", '"')
@@ -297,7 +297,7 @@ class TestAWholeStudy:
         assert "1 of 2 runs failed" in result.stderr
         table = pd.read_parquet(tmp_path / "out" / "table.parquet")
         assert list(table["status"]) == ["done", "failed"]
-        assert table["reason"][1].startswith("ValueError: ")
+        assert table["reason"][1].startswith("ExperimentError: flats.tif: ")
         assert np.isnan(table["error_voxel_vertical"][1])
         assert table["reason"][1].partition(": ")[2] in (tmp_path / "out" / "study.html").read_text()
 

@@ -80,6 +80,7 @@ def made_up(folder, factors, *, repetitions=5, noise=1.0, **changes):
                 done = (photons, sections, repetition) != (2000.0, 4, 0)
                 row = {"photons_per_pixel": photons, "sections": sections, "seed": 0, "repetition": repetition}
                 row |= {"status": "done" if done else "failed", "reason": "" if done else "ValueError: <odd>"}
+                row |= {"verdict": "trusted" if done else None, "doubts": "" if done else None}
                 rows.append({**row, "error_voxel_vertical": 2.0 * sections, "seconds": 1.0, "key": key})
                 size = noise / np.sqrt(photons)
                 points = 0.01 + size * rng.normal(size=(20, 10, 3))
@@ -159,6 +160,16 @@ def test_the_page_tells_of_failed_runs_and_fetches_nothing(tmp_path):
     assert "http" not in text
     pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "summary.csv"), summary, check_dtype=False)
     assert (tmp_path / "scores.csv").exists()
+
+
+def test_the_page_counts_the_measurements_that_are_doubted_and_why(tmp_path):
+    study, table = made_up(tmp_path, FACTORS[:1])
+    page = write_study_report(tmp_path, study, "", table, where="a machine")[0].read_text()
+    assert "None: nothing speaks against any" in page
+    table.loc[[0, 3], ["verdict", "doubts"]] = ("doubtful", "air-level, cut-ends")
+    table.loc[[4], ["verdict", "doubts"]] = ("failed", "air-level")
+    page = write_study_report(tmp_path, study, "", table, where="a machine")[0].read_text()
+    assert "3 of the 15 are not trusted by their own checks: air-level 3, cut-ends 2." in page
 
 
 def test_a_study_all_of_whose_runs_failed_still_has_its_page(tmp_path):

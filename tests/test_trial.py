@@ -16,17 +16,22 @@ def without_times(scores):
     return {name: value for name, value in scores.items() if not name.startswith("seconds")}
 
 
+def stamps(folder):
+    """Return when each stack, outline, volume and stage of a shared folder was written."""
+    return {path.name: path.stat().st_mtime_ns for path in folder.rglob("*") if path.suffix in (".npy", ".kept")}
+
+
 def test_sharing_changes_nothing(tmp_path):
     other = trial({"sections": 4}, acquisition={"steps_per_turn": 11})
     for part in (*clean_parts(other.scenario), Volumes(other.scenario, other.options)):
         part.make(tmp_path / "shared")
     one = trial({"sections": 5})
-    kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "shared").rglob("*.np?")}
+    kept = stamps(tmp_path / "shared")
     shared, alone = one.carry_out(tmp_path / "shared"), one.carry_out(tmp_path / "alone")
     assert without_times(shared.scores) == without_times(alone.scores)
     for name in ("points", "strain"):
         np.testing.assert_array_equal(shared.arrays[name], alone.arrays[name])
-    now = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "shared").rglob("*.np?")}
+    now = stamps(tmp_path / "shared")
     # reference stack, outline and volumes were found; only the test's radiographs and its modes are new
     assert {name: now[name] for name in kept} == kept
     assert {name.split("-")[0] for name in now.keys() - kept.keys()} == {"test", "stage"}
