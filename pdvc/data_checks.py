@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pdvc.examination import Examination, StackLook, full_scale
+from pdvc.examination import Examination, StackLook, examine, full_scale, with_angles
 from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, Experiment, ExperimentError, Series
 from pdvc.history import Ramp, TimeFunctions
+from pdvc.progress import Progress, silent
 from pdvc.verdict import Doubt, listed
 
 AIR_ERROR, AIR_DOUBT = 0.3, 0.03
@@ -34,6 +35,13 @@ PLANE_SHARE, PLANE_PX = 0.02, 3.0
 """What the plane of the source may be off: a share of the rows, or px where that is more."""
 ALIKE, ANOTHER = 0.1, 0.4
 """A gain in correlation that is no chance; a correlation below which two pictures show different samples."""
+
+
+def usable(experiment: Experiment, *, progress: Progress = silent) -> Examination:
+    """Examine an experiment, its angles too; raises ExperimentError where it cannot be measured."""
+    found = examine(experiment, progress=progress)
+    check_usable(found, experiment)
+    return with_angles(found, experiment, progress=progress)
 
 
 def check_usable(found: Examination, experiment: Experiment) -> None:

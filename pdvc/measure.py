@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from pdvc import gauss_newton, pgd
 from pdvc.compilation import compile_kernels
-from pdvc.data_checks import check_usable, doubts_of_data, doubts_of_time
+from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
 from pdvc.equations import Equations, check_size, linearise, residuals
-from pdvc.examination import examine, with_angles
 from pdvc.experiment import Experiment
 from pdvc.history import time_basis, with_onset
 from pdvc.measurement import Measurement, Stage, step_covariance, turned_std
@@ -57,9 +56,7 @@ def measure(
     options = resolved(options, experiment.geometry)
     options = options.model_copy(update={"time": with_onset(options.time, experiment.test)})
     time_functions = time_basis(options.time, experiment.test)
-    examined = examine(experiment, progress=progress)
-    check_usable(examined, experiment)
-    examined = with_angles(examined, experiment, progress=progress)
+    examined = usable(experiment, progress=progress)
     doubts = (*doubts_of_data(examined, experiment), *doubts_of_time(options.time, experiment.test))
     store = Store(work, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)

@@ -35,9 +35,8 @@ from numpy.typing import NDArray
 
 from pdvc import gauss_newton
 from pdvc.compilation import compile_comparison, compile_kernels
-from pdvc.data_checks import check_usable, doubts_of_reference
+from pdvc.data_checks import doubts_of_reference, usable
 from pdvc.equations import Equations
-from pdvc.examination import examine, with_angles
 from pdvc.experiment import Experiment, InterruptedScan
 from pdvc.geometry import ConeBeam
 from pdvc.history import Steps, time_basis
@@ -93,9 +92,7 @@ def correlate(
     started = time.perf_counter()
     # volumes are filtered here, not the radiographs
     options = resolved(options, experiment.geometry).model_copy(update={"smooth_px": 0.0})
-    examined = examine(experiment, progress=progress)
-    check_usable(examined, experiment)
-    examined = with_angles(examined, experiment, progress=progress)
+    examined = usable(experiment, progress=progress)
     store = Store(work, experiment)
     calibration, outline = calibrated(experiment, options, store, progress)
     window = used_window(experiment.geometry, options, outline.hull)

@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pdvc.data_checks import check_usable, doubts_of_data, doubts_of_time
-from pdvc.examination import examine, with_angles
+from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
 from pdvc.experiment import ExperimentError
 from pdvc.history import Polynomial, Ramp
 from tests.spheres import DARK, OPEN, experiment, with_reference, with_test
@@ -21,9 +20,7 @@ def good():
 
 
 def doubts(here):
-    examined = examine(here)
-    check_usable(examined, here)
-    return {each.name: each for each in doubts_of_data(with_angles(examined, here), here)}
+    return {each.name: each for each in doubts_of_data(usable(here), here)}
 
 
 def with_counts(here, change, steps=slice(None)):

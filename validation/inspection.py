@@ -9,8 +9,8 @@ import numpy as np
 import psutil
 
 from pdvc.compilation import compile_kernels
-from pdvc.data_checks import check_usable, doubts_of_data, doubts_of_time
-from pdvc.examination import Examination, examine, with_angles
+from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
+from pdvc.examination import Examination
 from pdvc.experiment import REFERENCE, TEST, Experiment
 from pdvc.history import time_basis, with_onset
 from pdvc.options import MeasureOptions, StageOptions, resolved
@@ -53,9 +53,7 @@ def inspect(experiment: Experiment, options: MeasureOptions, *, progress: Progre
 
     Raises ValueError, in one line, where the data cannot be used.
     """
-    found = examine(experiment, progress=progress)
-    check_usable(found, experiment)
-    found = with_angles(found, experiment, progress=progress)
+    found = usable(experiment, progress=progress)
     options = resolved(options, experiment.geometry)
     options = options.model_copy(update={"time": with_onset(options.time, experiment.test)})
     started = time.perf_counter()
