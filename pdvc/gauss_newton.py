@@ -99,6 +99,7 @@ def solve(
         temporal=np.empty((0, time_functions.shape[1])),
         spatial=np.empty((0, *shape[1:])),
         rms=np.array(rms),
+        last_change_voxel=last,
         stop=Stop.UNFINISHED if moving else Stop.NO_GAIN if stuck == len(blocks) else Stop.CONVERGED,
         stop_reason=_reason(len(blocks), len(moving), stuck, last, least_change_voxel, most_passes),
     )
@@ -186,7 +187,7 @@ def _reason(blocks: int, moving: int, stuck: int, last: float, least_change_voxe
     """Say why the passes ended."""
     if moving:
         still = "the solution still moves" if blocks == 1 else f"{moving} of {blocks} parts still move"
-        return f"{most_passes} passes done, the most allowed: allow more, {still}"
+        return f"{most_passes} passes done, the most allowed: allow more, {still}, by {last:.2g} voxel rms"
     if stuck == blocks:
         return "no step lowers the residual further: converged, within the precision of the sums"
     reason = f"converged: the last change was {last:.2g} voxel rms, under {least_change_voxel:.2g}"

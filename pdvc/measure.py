@@ -201,6 +201,7 @@ class _Solver:
                     rms=kept["rms"],
                     stop=Stop(str(kept["stop"])),
                     stop_reason=str(kept["stop_reason"]),
+                    last_change_voxel=float(kept["last_change"]),
                 )
             )
             start = kept["coefficients"]
@@ -255,6 +256,7 @@ def _packed(solution: Solution) -> dict[str, NDArray[Any]]:
         "rms": solution.rms,
         "stop": np.array(str(solution.stop)),
         "stop_reason": np.array(solution.stop_reason),
+        "last_change": np.array(solution.last_change_voxel),
     }
 
 

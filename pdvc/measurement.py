@@ -46,6 +46,8 @@ class Stage:
     """Why the stage ended, for machines."""
     stop_reason: str
     """Why the stage ended, in words and numbers."""
+    last_change_voxel: float = float("nan")
+    """Rms displacement of the last change, voxels; NaN for a solver by modes."""
 
     @property
     def modes(self) -> int:
@@ -254,7 +256,7 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
         axes = (f"{name}_section", f"{name}_motion") if own else ("section", "motion")
         data[f"{name}_spatial"] = ((f"{name}_mode", *axes), stage.spatial, {"units": "voxel"})
         data[f"{name}_rms"] = (f"{name}_pass", stage.rms)
-        for key in ("name", "scale", "solver", "unknowns", "stop_reason"):
+        for key in ("name", "scale", "solver", "unknowns", "stop_reason", "last_change_voxel"):
             data.attrs[f"{name}_{key}"] = getattr(stage, key)
         data.attrs[f"{name}_stop"] = str(stage.stop)
     data.attrs["stages"] = len(m.stages)
@@ -315,6 +317,7 @@ def _unpack(data: xr.Dataset) -> Measurement:
             rms=get(f"{name}_rms"),
             stop=Stop(attrs[f"{name}_stop"]),
             stop_reason=str(attrs[f"{name}_stop_reason"]),
+            last_change_voxel=float(attrs[f"{name}_last_change_voxel"]),
         )
         for name in (f"stage{n}" for n in range(int(attrs["stages"])))
     )

@@ -29,6 +29,8 @@ PRIOR_DEVIATIONS = 3.0
 """Standard deviations of the prior beyond which the prior is wrong, not the amplitude rare."""
 FROM_DATA = 0.5
 """Share of a motion's prior variance that the data remove at least."""
+STILL_MOVES_VOXEL = 0.02
+"""A last change as large as this, rms: what a good measurement errs by across the beam."""
 CUT_ROWS = 0.02
 """Share of the used rows whose rays may leave the volume through a cut end, at most, at any step."""
 STRENGTH_MPA = 5000.0
@@ -190,7 +192,7 @@ def cut_rows(found: Measurement, volume: Volume, geometry: ConeBeam) -> Floats:
 
 def _of_convergence(found: Measurement) -> Iterator[Doubt]:
     last = found.stages[-1]
-    if last.stop is Stop.UNFINISHED:
+    if last.stop is Stop.UNFINISHED and not last.last_change_voxel < STILL_MOVES_VOXEL:
         yield Doubt(
             name="not-converged",
             figure=last.stop_reason,

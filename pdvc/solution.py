@@ -31,6 +31,8 @@ class Solution:
     """Rms residual (pass,), grey levels: before the first mode and after each."""
     stop: Stop
     stop_reason: str
+    last_change_voxel: float = float("nan")
+    """Rms displacement of the last change, in the part that it moved most; NaN for a solver by modes."""
 
 
 def evaluated(linearise: Linearise, time_functions: Floats, shape: tuple[int, ...]) -> Callable[[Floats], Equations]:

@@ -9,6 +9,8 @@ import shutil
 import numpy as np
 import pytest
 
+from pdvc.experiment import DESCRIPTION, Description, write_description
+from pdvc.measurement import read_measurement
 from tests.command_line import only_line, pdvc_bench
 from tests.tiny_scenarios import TINY
 
@@ -143,3 +145,80 @@ def test_an_interrupted_job_says_so_and_goes_on_to_the_same_counts(job, monkeypa
     for name in ("reference/radiographs.tif", "test/radiographs.tif", "flats.tif", "darks.tif", "experiment.toml"):
         expected = (folder / "out" / "experiment" / name).read_bytes()
         assert (out / "experiment" / name).read_bytes() == expected, name
+
+
+@pytest.fixture(scope="module")
+def turned(job):
+    """Return a copy of the experiment whose stage is said to turn the other way."""
+    folder, _ = job
+    copy = folder / "turned"
+    shutil.copytree(folder / "out" / "experiment", copy, ignore=shutil.ignore_patterns("truth"))
+    description = Description.read(copy / DESCRIPTION)
+    stacks = {name: getattr(description, name) for name in ("reference", "test")}
+    other = {
+        name: stack.model_copy(update={"angle_deg": tuple(-angle for angle in stack.angle_deg)})
+        for name, stack in stacks.items()
+    }
+    write_description(copy, description.model_copy(update=other))
+    return copy
+
+
+def test_inspect_shows_what_is_found_and_proposed(job):
+    folder, _ = job
+    picture = folder / "look.png"
+    result = pdvc_bench("inspect", folder / "out" / "experiment", "-o", picture)
+    assert result.exit_code == 0, result.stderr
+    assert "nothing speaks against these data" in result.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    found = " ".join(result.stdout.split())
+    assert "60 reference views, 25 steps" in found
+    assert re.search(r"loading begins after step (9|10|11) ", found)
+    measured = read_measurement(folder / "out" / "measurement.nc")
+    assert f"discard_rows = {measured.window[0]}" in found
+    assert f"unknowns {measured.unknowns} " in found
+
+
+def test_inspect_names_a_stage_that_turns_the_other_way(turned, job):
+    folder, _ = job
+    result = pdvc_bench("inspect", turned, "-o", folder / "turned.png")
+    assert result.exit_code == 0, result.stderr
+    assert re.search(r"rotation-sign: opposite views fit together with -(0\.9|1\.0)\d times", result.stdout)
+    assert "give reference and test angles the other sign" in result.stdout
+
+
+def test_inspect_refuses_what_cannot_be_measured(job):
+    folder, _ = job
+    copy = folder / "dark"
+    shutil.copytree(folder / "out" / "experiment", copy)
+    shutil.copy(copy / "darks.tif", copy / "flats.tif")
+    result = pdvc_bench("inspect", copy, "-o", folder / "never.png")
+    assert result.exit_code == 2
+    assert "flats.tif: expected more counts than the darks" in only_line(result)
+    assert not (folder / "never.png").exists()
+
+
+def test_a_measurement_that_failed_says_so_everywhere(turned, job):
+    folder, _ = job
+    out = folder / "turned.nc"
+    result = pdvc_bench("measure", turned, "-o", out)
+    assert result.exit_code == 3, result.stderr
+    assert "verdict: failed" in result.stderr
+    assert "rotation-sign" in result.stderr
+    verdict = read_measurement(out).verdict
+    assert verdict.word == "failed"
+    assert "rotation-sign" in verdict.names
+    assert pdvc_bench("report", out, "-o", folder / "turned-page").exit_code == 0
+    page = (folder / "turned-page" / "report.html").read_text()
+    assert page.index('<span class="failed">failed</span>') < page.index("<h2>Summary</h2>")
+    assert "Nothing below is to be believed." in page
+    assert "<td>rotation-sign</td>" in page
+
+
+def test_console_scores_and_file_tell_the_same_verdict(job):
+    """So few and coarse pixels leave a doubt about the steps that see a flat face along the beam, and none else."""
+    folder, result = job
+    verdict = read_measurement(folder / "out" / "measurement.nc").verdict
+    assert set(verdict.names) <= {"step-residual"}
+    assert f"verdict: {verdict.word}" in result.stderr
+    scores = json.loads((folder / "out" / "scores.json").read_text())
+    assert (scores["verdict"], scores["doubts"]) == (verdict.word, ", ".join(verdict.names))

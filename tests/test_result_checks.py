@@ -108,6 +108,13 @@ def test_a_prior_that_is_too_narrow_is_told_by_its_own_deviations():
     assert "prior" not in doubts(result(), prior_voxel=100.0)
 
 
+def test_a_solution_that_hardly_moves_any_more_has_converged():
+    still = replace(LAST, stop=Stop.UNFINISHED, last_change_voxel=0.004)
+    assert doubts(result(stages=(GOOD.stages[0], still))) == {}
+    far = replace(still, last_change_voxel=0.4)
+    assert set(doubts(result(stages=(GOOD.stages[0], far)))) == {"not-converged"}
+
+
 def test_what_is_explained_by_nothing_is_fatal():
     assert doubts(result(snr_final_db=np.full(24, 3.0)))["not-explained"].fatal
     assert doubts(result(snr_reprojection_db=np.full(40, 3.0)))["reference-volume"].fatal

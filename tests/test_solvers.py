@@ -359,6 +359,7 @@ def test_gauss_newton_stops_at_the_most_passes():
         least_change_voxel=1e-9,
     )
     assert "1 passes done, the most allowed: allow more" in found.stop_reason
+    assert f"by {found.last_change_voxel:.2g} voxel rms" in found.stop_reason
     assert found.stop is Stop.UNFINISHED
 
 
