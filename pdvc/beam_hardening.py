@@ -92,7 +92,11 @@ def _whole_grid(geometry: ConeBeam) -> Grid:
     radius = (geometry.columns / 2 - 1) * geometry.voxel_mm - abs(geometry.column_shift_mm) / geometry.magnification
     height = seen_half_height_mm(geometry, radius)
     if radius <= 0 or height <= 0:
-        raise ValueError("geometry: the detector does not see the rotation axis")
+        raise ValueError(
+            "geometry: expected a detector that sees the rotation axis and the plane of the source, found shifts of "
+            f"{geometry.column_shift_mm:.4g} and {geometry.row_shift_mm:.4g} mm, a detector of {geometry.rows} x "
+            f"{geometry.columns} px of {geometry.pixel_mm:.4g} mm, the axis {geometry.source_axis_mm:.4g} mm away"
+        )
     return Grid.around(np.array([-radius, -radius, -height]), np.array([radius, radius, height]), geometry.voxel_mm)
 
 

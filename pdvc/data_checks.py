@@ -308,7 +308,6 @@ def _of_angles(found: Examination, experiment: Experiment) -> Iterator[Doubt]:
             f"{np.rad2deg(np.median(apart[elsewhere])):.0f} degrees (median) from its angle (correlation {best:.2f}, "
             f"{recorded:.2f} at its angle)",
             advice=_what_of_the_angles(experiment),
-            fatal=bool(np.median(gain) > ALIKE),
         )
         return
     # one step by itself may move by much: only what is plain counts

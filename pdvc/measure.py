@@ -35,6 +35,7 @@ from pdvc.solution import Solution
 from pdvc.store import Store
 from pdvc.uncertainty import posterior
 from pdvc.verdict import Stop, Verdict, explained_by
+from pdvc.volume import Volume
 from pdvc.window import used_window
 
 __all__ = ["MeasureOptions", "StageOptions", "measure"]
@@ -52,13 +53,29 @@ def measure(
     """
     compiling = time.perf_counter()
     compile_kernels(progress=progress)
-    started = time.perf_counter()
+    compiling = time.perf_counter() - compiling
+    examining = time.perf_counter()
     options = resolved(options, experiment.geometry)
     options = options.model_copy(update={"time": with_onset(options.time, experiment.test)})
-    time_functions = time_basis(options.time, experiment.test)
     examined = usable(experiment, progress=progress)
     doubts = (*doubts_of_data(examined, experiment), *doubts_of_time(options.time, experiment.test))
-    store = Store(work, experiment)
+    examining = time.perf_counter() - examining
+    with explained_by(doubts):
+        found, volume = _measured(experiment, options, Store(work, experiment), progress)
+    after = doubts_of_result(found, volume, experiment.geometry, options.prior_voxel)
+    return replace(
+        found,
+        verdict=Verdict(doubts=(*doubts, *after)),
+        seconds={"compile": compiling, "examine": examining, **found.seconds},
+    )
+
+
+def _measured(
+    experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress
+) -> tuple[Measurement, Volume]:
+    """Return a measurement without a verdict, and the reference volume at scale 1."""
+    started = time.perf_counter()
+    time_functions = time_basis(options.time, experiment.test)
     calibration, outline = calibrated(experiment, options, store, progress)
     window = used_window(experiment.geometry, options, outline.hull)
     options = options.model_copy(update={"discard_rows": window[0], "discard_columns": window[2]})
@@ -72,14 +89,13 @@ def measure(
     fine = prepared[1]
     solving = time.perf_counter()
     solver = _Solver(prepared, time_functions, options, store, progress)
-    with explained_by(doubts):
-        start = solver.run("rigid", rigid, options.rigid, np.zeros((len(time_functions), *rigid.shape)))
-        start = sections.rigid(start, rigid)
-        standing = np.zeros((len(experiment.test), *sections.shape))
-        initial = residuals(fine.images, sections, standing, progress=progress, task="initial residual")
-        moved = np.einsum("ft,fjk->tjk", time_functions, start)
-        after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
-        coefficients = solver.run("deformation", sections, options.deformation, start)
+    start = solver.run("rigid", rigid, options.rigid, np.zeros((len(time_functions), *rigid.shape)))
+    start = sections.rigid(start, rigid)
+    standing = np.zeros((len(experiment.test), *sections.shape))
+    initial = residuals(fine.images, sections, standing, progress=progress, task="initial residual")
+    moved = np.einsum("ft,fjk->tjk", time_functions, start)
+    after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
+    coefficients = solver.run("deformation", sections, options.deformation, start)
     equations = solver.equations_at(sections, coefficients)
     amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
     propagating = time.perf_counter()
@@ -133,7 +149,6 @@ def measure(
             for name, part in known.by_source.items()
         },
         seconds={
-            "compile": started - compiling,
             "reconstruct": solving - started,
             "measure": propagating - solving,
             "uncertainty": ended - propagating,
@@ -141,8 +156,7 @@ def measure(
         options=options.template(),
         versions=versions(),
     )
-    after = doubts_of_result(found, fine.images.volume, experiment.geometry, options.prior_voxel)
-    return replace(found, verdict=Verdict(doubts=(*doubts, *after)))
+    return found, fine.images.volume
 
 
 def _on_the_axis(

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
+import numpy as np
+
 Word = Literal["trusted", "doubtful", "failed"]
 
 STEPS_NAMED = 8
@@ -83,12 +85,19 @@ class NotMeasuredError(ValueError):
 
 @contextmanager
 def explained_by(doubts: Sequence[Doubt]) -> Iterator[None]:
-    """Raise NotMeasuredError in place of a ValueError: what came of doubtful data is told with the doubts."""
+    """Raise NotMeasuredError in place of a ValueError, or of numbers that overflow: told with the doubts before."""
     try:
-        yield
+        with np.errstate(over="raise", invalid="raise", divide="raise"):
+            yield
+    except FloatingPointError as error:
+        told = f"motion: expected numbers that can be computed with, found {error}"
+        raise NotMeasuredError(f"{told}{_before(doubts)}") from error
     except ValueError as error:
-        before = f"; what speaks against the data: {'; '.join(map(str, doubts))}" if doubts else ""
-        raise NotMeasuredError(f"{error}{before}") from error
+        raise NotMeasuredError(f"{error}{_before(doubts)}") from error
+
+
+def _before(doubts: Sequence[Doubt]) -> str:
+    return f"; what speaks against the data: {'; '.join(map(str, doubts))}" if doubts else ""
 
 
 UNCHECKED = Verdict(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pdvc.lock import held
 from pdvc.measurement import Measurement, write_measurement
 from pdvc.progress import Progress, silent
+from pdvc.verdict import explained_by
 
 if TYPE_CHECKING:
     from pdvc.experiment import Experiment
@@ -40,7 +41,8 @@ def measure_into(
     with held(folder):
         try:
             measurement = measure(experiment, options, progress=progress, work=folder)
-            check_finite(measurement)
+            with explained_by(measurement.verdict.doubts):
+                check_finite(measurement)
             write_measurement(measurement, file)
         except ValueError:
             if work is None and new:
