@@ -29,6 +29,7 @@ PRIOR_DEVIATIONS = 3.0
 """Standard deviations of the prior beyond which the prior is wrong, not the amplitude rare."""
 FROM_DATA = 0.5
 """Share of a motion's prior variance that the data remove at least."""
+FEW_STEPS = 3
 STILL_MOVES_VOXEL = 0.02
 """A last change as large as this, rms: what a good measurement errs by across the beam."""
 CUT_ROWS = 0.02
@@ -203,7 +204,7 @@ def _of_convergence(found: Measurement) -> Iterator[Doubt]:
 def _of_basis(found: Measurement) -> Iterator[Doubt]:
     functions, steps = found.time_functions.shape
     alone = (np.count_nonzero(found.time_functions, axis=0) <= 1).all()
-    if functions >= steps and not alone:
+    if steps < FEW_STEPS or (functions >= steps and not alone):
         yield Doubt(
             name="few-steps",
             figure=f"{functions} time functions for {steps} steps",

@@ -129,13 +129,15 @@ DISTANCES = (
     ),
     BadInput(
         name="source-axis-double",
+        due="unknowable",
         change=scaled("geometry", "source_axis_mm", 2),
-        wrong="`source_axis_mm` is twice what it was.",
+        wrong="`source_axis_mm` is twice what it was: a sample twice as large shows the same.",
     ),
     BadInput(
         name="source-axis-half",
+        due="unknowable",
         change=scaled("geometry", "source_axis_mm", 0.5),
-        wrong="`source_axis_mm` is half of what it was.",
+        wrong="`source_axis_mm` is half of what it was: a sample half as large shows the same.",
     ),
     BadInput(
         name="source-detector-half",
@@ -150,8 +152,9 @@ DISTANCES = (
     ),
     BadInput(
         name="axis-to-detector-for-source-to-axis",
+        due="unknowable",
         change=settled("geometry", source_axis_mm=800 * 27 / 28),
-        wrong="`source_axis_mm` is the distance from axis to detector.",
+        wrong="`source_axis_mm` is the distance from axis to detector: a larger sample shows the same.",
     ),
     BadInput(
         name="distances-in-metres",

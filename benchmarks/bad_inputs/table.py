@@ -25,8 +25,8 @@ Written by `make bad-inputs`, which fails while any row has a fault.
 """
 
 _UNKNOWABLE = """
-Rows marked * have no fault that a folder could show: it is, to the last count, that of another sample, or of another
-motion, which was measured well.
+Rows marked * have no fault that a folder could show: it is, to the last count, that of another sample, a larger or a
+smaller one, or of another motion, which was measured well.
 """
 
 
