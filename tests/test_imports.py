@@ -9,6 +9,8 @@ from pathlib import Path
 
 import grimp
 
+from tests.mutants import TESTS
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -53,3 +55,10 @@ def test_no_test_module_imports_another():
                     part for name in (*whole, *(each.name for each in node.names)) for part in name.split(".")
                 )
         assert not named & tests, f"{path.name} imports a test module"
+
+
+def test_every_room_that_faults_are_planted_in_and_every_test_file_that_guards_it_is_there():
+    for room, files in TESTS.items():
+        assert (ROOT / "pdvc" / f"{room}.py").is_file()
+        for name in files:
+            assert (ROOT / "tests" / f"test_{name}.py").is_file()

@@ -67,14 +67,26 @@ def test_a_shift_of_the_frame_shifts_where_the_motion_is_and_nothing_else(case, 
         np.testing.assert_allclose(sections.displacement(b, points + shift), expected, atol=1e-4)
 
 
+def visible(case, difference):
+    """Return the size of a difference of coefficients by what it changes in radiographs, voxels of a usual motion.
+
+    Along the beam rounding in single precision makes differences some R / r = 400 times as large, which no radiograph
+    shows.
+    """
+    matrix = gauss_newton.hessian(case.equations(case.amplitude).matrix, case.time_functions)
+    change = difference.ravel()
+    return np.sqrt(change @ matrix @ change * len(change) / np.trace(matrix))
+
+
 @QUICK
 @given(moving_cases, st.floats(0.01, 100.0))
 def test_volume_and_radiographs_on_another_grey_scale_give_the_same_motion(case, scale):
     images = case.images
     volume = replace(images.volume, values=(scale * images.volume.values).astype(np.float32))
     brighter = replace(images, volume=volume, grey=(scale * images.grey).astype(np.float32))
-    one, two = (solved(case, each, case.time_functions) for each in (images, brighter))
-    np.testing.assert_allclose(two, one, atol=1e-4)
+    # to the end: on the way there rounding changes the steps too, by a part of what is still missing
+    one, two = (solved(case, each, case.time_functions, passes=10) for each in (images, brighter))
+    assert visible(case, two - one) < 5e-6
 
 
 def reordered(case, order):
