@@ -8,7 +8,7 @@ import platform
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -45,9 +45,10 @@ def held(folder: Path) -> Iterator[None]:
         if lock.lock_counter == 1:
             command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
             since = time.strftime("%Y-%m-%d %H:%M:%S")
-            holder.write_text(
-                f"process {os.getpid()} on {platform.node()} since {since} ({command})", encoding="utf-8"
-            )
+            told = f"process {os.getpid()} on {platform.node()} since {since} ({command})"
+            # where the disk is full, what follows says so with the file that is needed
+            with suppress(OSError):
+                holder.write_text(told, encoding="utf-8")
         yield
     finally:
         if lock.lock_counter == 1:

@@ -367,35 +367,3 @@ def test_amplitudes_of_another_basis_are_refused():
 def test_a_volume_of_another_type_is_refused():
     with pytest.raises(ValueError, match="volume: expected float32"):
         replace(textured(), values=textured().values.astype(float))
-
-
-FAR = 5e4
-"""Voxels: far beyond the source, whose distance is 600."""
-
-
-@pytest.mark.parametrize("size", [100.0, 700.0, 1100.0, FAR, 1e30])
-@pytest.mark.parametrize("kind", [0, 2, 4])
-def test_a_motion_however_large_writes_where_it_may(kind, size):
-    """A ray that was followed behind the source met sections that its band had no room for, and wrote beyond it."""
-    basis = SECTIONS
-    amplitude = np.zeros((2, *basis.shape))
-    amplitude[1, ::2, kind] = size
-    rays = np.stack([rays_at(0.4), rays_at(2.0)])
-    target = np.ones((2, *SHAPE), dtype=np.float32)
-    found = normal_equations(textured(), rays, basis, amplitude, target, target[:1], voxel_mm=VOXEL_MM)
-    assert np.isfinite(found.matrix).all()
-    alone = normal_equations(textured(), rays[:1], basis, amplitude[:1], target[:1], target[:1], voxel_mm=VOXEL_MM)
-    np.testing.assert_array_equal(found.matrix[0], alone.matrix[0])
-    assert found.chi2[0] == alone.chi2[0] < found.chi2[1] + 1e9
-
-
-def test_a_motion_out_of_the_scanner_is_as_bad_as_can_be_and_never_projected():
-    amplitude = np.zeros((2, *ONE.shape))
-    amplitude[1, 0, 0] = FAR
-    rays = np.stack([rays_at(0.4), rays_at(2.0)])
-    target = np.zeros((2, *SHAPE), dtype=np.float32)
-    found = normal_equations(textured(), rays, ONE, amplitude, target, target[:1] + 1, voxel_mm=VOXEL_MM)
-    assert np.isfinite(found.chi2).tolist() == [True, False]
-    assert found.chi2[1] == np.inf
-    with pytest.raises(ValueError, match="amplitude: expected the sample in the beam, got it outside in 1 steps"):
-        project(textured(), rays, SHAPE, ONE, amplitude, voxel_mm=VOXEL_MM)
