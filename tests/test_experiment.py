@@ -19,7 +19,6 @@ from pdvc.experiment import (
     read_experiment,
     write_description,
 )
-from pdvc.stacks import read_stack
 from tests.laws import law
 
 ROWS, COLUMNS = 6, 4
@@ -163,36 +162,6 @@ def test_ordinary_tiffs_of_other_programs_are_read(folder, how):
     images = counts("test/radiographs.tif")
     tifffile.imwrite(folder / "test/radiographs.tif", images, **how)
     np.testing.assert_array_equal(read_experiment(folder).test.counts, images)
-
-
-@pytest.mark.filterwarnings("ignore:.*stored as RGB:DeprecationWarning")
-@pytest.mark.parametrize("how", [{}, {"compression": "zlib"}, {"imagej": True}])
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
-def test_a_stack_of_few_images_written_in_the_plainest_way_is_read(folder, count, how):
-    """Of three or four images tifffile makes the colours of one."""
-    images = np.random.default_rng(count).integers(0, 65536, (count, ROWS, 7), dtype=np.uint16)
-    tifffile.imwrite(folder / "test.tif", images, **how)
-    np.testing.assert_array_equal(read_stack(folder / "test.tif", (ROWS, 7)), images)
-
-
-@pytest.mark.filterwarnings("ignore:.*stored as RGB:DeprecationWarning")
-@pytest.mark.parametrize("share", [0.2, 0.9])
-def test_three_images_in_one_page_are_missed_when_cut_off(folder, share):
-    images = np.zeros((3, ROWS, 7), dtype=np.uint16)
-    tifffile.imwrite(folder / "test.tif", images)
-    cut(folder / "test.tif", share)
-    with pytest.raises(ExperimentError, match=r"test\.tif: truncated: expected \d+ bytes"):
-        read_stack(folder / "test.tif", (ROWS, 7))
-
-
-def test_a_header_that_promises_more_than_any_memory_is_refused_before_it_is_read(folder):
-    path = folder / "flats.tif"
-    tifffile.imwrite(path, counts("flats.tif"), photometric="minisblack", compression="zlib")
-    with tifffile.TiffFile(path, mode="r+b") as tiff:
-        for page in tiff.pages:
-            page.tags["ImageLength"].overwrite(2_000_000_000)
-            page.tags["ImageWidth"].overwrite(2_000_000_000)
-    assert f"{path}: " in refused(folder)
 
 
 def test_pages_written_one_by_one_without_metadata_are_one_stack(folder):
@@ -378,26 +347,6 @@ def test_a_stack_whose_writer_was_killed_after_the_last_image_is_finished_by_the
         assert writer.done == 16
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), images)
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
-
-
-def test_a_note_of_progress_that_a_kill_left_beside_a_whole_stack_goes(tmp_path):
-    images = counts("test/radiographs.tif")
-    write_stack(tmp_path / "a.tif", images)
-    (tmp_path / "a.tif.count").write_text("3")
-    write_stack(tmp_path / "a.tif", images)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
-
-
-@pytest.mark.parametrize("left", [0, 5, 300])
-def test_a_whole_stack_that_was_damaged_since_is_begun_anew(tmp_path, left):
-    images = counts("reference/radiographs.tif")
-    write_stack(tmp_path / "a.tif", images)
-    (tmp_path / "a.tif").write_bytes((tmp_path / "a.tif").read_bytes()[:left])
-    with StackWriter(tmp_path / "a.tif", images.shape) as writer:
-        assert writer.done == 0
-        for i, image in enumerate(images):
-            writer.write(i, image)
-    np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), images)
 
 
 def test_a_stack_of_another_shape_is_begun_anew(tmp_path):
