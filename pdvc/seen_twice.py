@@ -28,6 +28,8 @@ COLUMNS = 110
 """Radiographs are binned to about this many columns."""
 ROWS_SHARE = 12
 """One of so many rows, to each side of the plane of the source, takes part: there opposite rays nearly coincide."""
+NEAR_ROWS, ALL_ROWS = 13, 81
+"""Rows, at most, that the fan angle is fitted on, and that the plane of the source is looked for in."""
 LEAST_VIEWS = 16
 LARGEST_FACTOR = 4.0
 PLANE_ROWS = 0.4
@@ -73,29 +75,37 @@ def seen_twice(series: Series, geometry: ConeBeam, calibration: Calibration) -> 
     middle = (coarse.rows - 1) / 2 - coarse.row_shift_mm / coarse.pixel_mm
     reach = max(2, coarse.rows // ROWS_SHARE)
     low = int(np.clip(round(middle) - reach, 0, max(coarse.rows - 2 * reach - 1, 0)))
+    near = _some(low, min(low + 2 * reach, coarse.rows - 1), NEAR_ROWS)
+    half = int(PLANE_ROWS * coarse.rows)
+    all_over = _some((coarse.rows - 1) // 2 - half, coarse.rows // 2 + half, ALL_ROWS)
     few = calibration.binned(bins)
-    views = np.stack([grey_levels(binned(series.counts[k], bins), few) for k in order]).astype(float)
+    rows = np.union1d(near, all_over)
+    views = np.stack([grey_levels(binned(series.counts[k], bins), few)[rows] for k in order]).astype(float)
     views = _on_equal_angles(views, angle[order])
-    found = _compared(_Mirror(views[:, low : low + 2 * reach + 1], coarse), bins)
-    plane = _plane(_Mirror(views, coarse), found.axis_px / bins)
+    found = _compared(_Mirror(views[:, np.isin(rows, near)], coarse), bins)
+    plane = _plane(_Mirror(views[:, np.isin(rows, all_over)], coarse), all_over, found.axis_px / bins)
     if plane is None:
         return found
     return replace(found, plane_px=(plane[0] - middle) * bins, plane_std_px=plane[1] * bins)
 
 
-def _plane(mirror: _Mirror, axis_px: float) -> tuple[float, float] | None:
+def _some(first: int, last: int, most: int) -> NDArray[np.int64]:
+    """Return rows from the first to the last, at most so many of them, evenly spread."""
+    return np.unique(np.round(np.linspace(first, last, min(most, last - first + 1))).astype(np.int64))
+
+
+def _plane(mirror: _Mirror, rows: NDArray[np.int64], axis_px: float) -> tuple[float, float] | None:
     """Return the row about which opposite views fit best, and its deviation, by a parabola through the mismatch."""
-    squares = min((mirror.squares(sign, axis_px) for sign in (1.0, -1.0)), key=np.median)
-    rows = np.arange(len(squares)) - (len(squares) - 1) / 2
-    part = np.abs(rows) < PLANE_ROWS * len(rows)
-    if part.sum() < 8:
+    if len(rows) < 8:
         return None
-    (bend, slope, _), covariance = np.polyfit(rows[part], squares[part], 2, cov=True)
-    if bend <= 0 or abs(slope / (2 * bend)) > len(rows):
+    squares = min((mirror.squares(sign, axis_px) for sign in (1.0, -1.0)), key=np.median)
+    middle, span = rows.mean(), float(np.ptp(rows))
+    (bend, slope, _), covariance = np.polyfit(rows - middle, squares, 2, cov=True)
+    if bend <= 0 or abs(slope / (2 * bend)) > 1.25 * span:
         return None
     way = np.array([slope / (2 * bend**2), -1 / (2 * bend), 0.0])
     deviation = float(np.sqrt(max(way @ covariance @ way, 0.0) * _ALIKE_ROWS))
-    return float(-slope / (2 * bend) + (len(rows) - 1) / 2), deviation
+    return float(middle - slope / (2 * bend)), deviation
 
 
 def _on_equal_angles(views: Floats, angle_rad: Floats) -> Floats:
