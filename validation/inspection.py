@@ -154,7 +154,7 @@ def lines_of(inspection: Inspection, experiment: Experiment) -> list[Line]:
                 "near 1",
             ),
             (
-                "angle most like, less recorded",
+                "most like view, off by",
                 f"{off:.1f} degrees, median",
                 f"under {np.rad2deg(like.spacing_rad):.0f}",
             ),
