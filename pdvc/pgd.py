@@ -56,9 +56,9 @@ def solve(
     stop, reason = Stop.MOST, f"{most_modes} modes found, as many as were asked for"
     for _ in range(most_modes):
         if noise_rms is not None and equations.rms**2 <= 2 * noise_rms**2:
-            stop, reason = (
-                Stop.NOISE_LEVEL,
-                (f"residual at noise level: rms {equations.rms:.3g} within sqrt(2) times {noise_rms:.3g} grey levels"),
+            stop = Stop.NOISE_LEVEL
+            reason = (
+                f"residual at noise level: rms {equations.rms:.3g} within sqrt(2) times {noise_rms:.3g} grey levels"
             )
             break
         before = equations.rms
@@ -74,10 +74,8 @@ def solve(
             if gain < WORTH_A_PASS:
                 break
         if not b.any():
-            stop, reason = (
-                Stop.NO_GAIN,
-                ("no further mode lowers the residual: what is left lies outside the bases, or is noise"),
-            )
+            stop = Stop.NO_GAIN
+            reason = "no further mode lowers the residual: what is left lies outside the bases, or is noise"
             break
         coefficients = coefficients + np.outer(a, b)
         temporal.append(a @ time_functions)
