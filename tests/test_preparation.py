@@ -10,8 +10,10 @@ import pytest
 from pdvc.options import resolved
 from pdvc.preparation import calibrated, prepare
 from pdvc.progress import silent
+from pdvc.radiographs import calibrate
 from pdvc.store import Store
 from pdvc.window import used_window
+from validation.bound import noise_free
 from validation.small_cases import SmallExperiment, small_scenario
 
 SMALL = SmallExperiment(small_scenario({"detector.bad_pixel_fraction": 0.0}))
@@ -60,3 +62,24 @@ def test_a_coarse_pixel_counts_where_more_than_two_thirds_of_it_were_measured(sc
     expected = np.ones_like(weight)
     expected[12 - window[0] // scale, 6 - window[2] // scale] = counts
     np.testing.assert_array_equal(weight, expected)
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_the_noise_told_of_the_radiographs_is_what_they_differ_by_from_those_without_noise(scale):
+    """Photons, readout and the two flats, which make a third of it in air, after filter and binning."""
+    clean = SmallExperiment(noise_free(SMALL.scenario)).experiment
+    noisy, options = SMALL.experiment, resolved(SMALL.options, SMALL.experiment.geometry)
+    calibration, outline = calibrated(clean, options, Store(None, clean), silent)
+    window = used_window(clean.geometry, options)
+
+    def seen(experiment, corrected):
+        store = Store(None, experiment)
+        return prepare(experiment, corrected, outline, window, scale, options, store, silent)
+
+    told = seen(noisy, calibrate(noisy).with_polynomial(outline.polynomial))
+    apart = told.images.grey.astype(float) - seen(clean, calibration).images.grey
+    # twenty thousand pixels, of which a filter leaves every fifth by itself; at scale 2 a quarter
+    assert told.noise_rms == pytest.approx(np.sqrt((apart**2).mean()), rel=0.04)
+    signal = told.images.grey.std(axis=(1, 2), dtype=float)
+    expected = 20 * np.log10(signal / np.sqrt((apart**2).mean(axis=(1, 2))))
+    assert told.snr_noise_db.mean() == pytest.approx(expected.mean(), abs=0.5)

@@ -70,6 +70,22 @@ def test_line_integrals_converge_to_the_closed_form_with_the_square_of_the_voxel
     assert errors[-1] < 3e-4
 
 
+@pytest.mark.parametrize("angle", [0.0, np.pi / 2])
+def test_rays_exactly_along_an_axis_see_what_their_neighbours_see(angle):
+    """The middle row and column of a detector of odd size, without shift and roll: no component across is left."""
+    scanner = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=45, columns=37)
+    shape = (scanner.rows, scanner.columns)
+    rays = rays_at(angle, scanner)
+    along, beside = (
+        project(textured(), rays_at(each, scanner), shape, ONE, still(), voxel_mm=VOXEL_MM)
+        for each in (angle, angle + 1e-7)
+    )
+    across = rays[1] + 22 * rays[2] + 18 * rays[3] - rays[0]
+    assert (np.abs(across) < 1e-12).sum() >= 1
+    assert along[22, 18] > 0.1 * along.max()
+    np.testing.assert_allclose(along, beside, atol=1e-4 * along.max())
+
+
 def test_a_translated_blob_is_where_the_translation_takes_it():
     rays = rays_at(1.3)
     amplitude = still()

@@ -207,6 +207,11 @@ def test_gauss_newton_lowers_the_residual_in_each_of_ten_passes_at_most_and_says
     assert len(recovered().rms) <= 11
 
 
+def test_gauss_newton_has_no_modes_but_their_shapes():
+    assert recovered().temporal.shape == (0, STEPS)
+    assert recovered().spatial.shape == (0, *SECTIONS.shape)
+
+
 def pgd_of_rank_one(**options):
     return pgd.solve(
         lineariser(images_of("one"), SECTIONS),
