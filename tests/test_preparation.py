@@ -70,7 +70,7 @@ def test_the_noise_told_of_the_radiographs_is_what_they_differ_by_from_those_wit
     clean = SmallExperiment(noise_free(SMALL.scenario)).experiment
     noisy, options = SMALL.experiment, resolved(SMALL.options, SMALL.experiment.geometry)
     calibration, outline = calibrated(clean, options, Store(None, clean), silent)
-    window = used_window(clean.geometry, options)
+    window = used_window(clean.geometry, options, outline.hull)
 
     def seen(experiment, corrected):
         store = Store(None, experiment)
