@@ -14,6 +14,7 @@ import numpy as np
 from pdvc.examination import Examination, StackLook, examine, full_scale, with_angles
 from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, Experiment, ExperimentError, Series
 from pdvc.history import Ramp, TimeFunctions
+from pdvc.onset import onset
 from pdvc.progress import Progress, silent
 from pdvc.verdict import Doubt, listed
 
@@ -27,6 +28,8 @@ NOISE_FACTOR = 1.5
 """The variance between flats may differ by this factor from what the description says: flats are few, pixels many."""
 GAP_RAD = np.deg2rad(15.0)
 """Gap between reference views above which streaks are seen in the volume."""
+ONSET_STEPS = 3
+"""Steps between the start of a ramp and the onset of loading that no force noise explains."""
 FAN_TOLERANCE = 0.15
 """What the fan angle may differ from the stated one, as a share, beyond five standard deviations."""
 AXIS_PX = 1.0
@@ -115,19 +118,24 @@ def doubts_of_data(found: Examination, experiment: Experiment) -> tuple[Doubt, .
     )
 
 
-def doubts_of_time(parts: tuple[TimeFunctions, ...], series: Series) -> tuple[Doubt, ...]:
-    """Return what is wrong with time functions for the steps of a test."""
-    late = [
-        part.start for part in parts if isinstance(part, Ramp) and part.start not in ("onset", *range(len(series) - 1))
-    ]
-    return tuple(
-        Doubt(
+def doubts_of_time(parts: tuple[TimeFunctions, ...], series: Series) -> Iterator[Doubt]:
+    """Give what is wrong with time functions for the steps of a test."""
+    starts = [part.start for part in parts if isinstance(part, Ramp) and isinstance(part.start, int)]
+    last = len(series) - 1
+    for start in starts:
+        if start >= last:
+            yield Doubt(
+                name="ramp-start",
+                figure=f"a ramp starts at step {start}, but the last step is {last}: it was left out",
+                advice="correct `start`, or leave the ramp out",
+            )
+    found, within = onset(series.force_N), [start for start in starts if start < last]
+    if found is not None and within and min(abs(start - found) for start in within) > ONSET_STEPS:
+        yield Doubt(
             name="ramp-start",
-            figure=f"a ramp starts at step {start}, but the last step is {len(series) - 1}: it was left out",
-            advice="correct `start`, or leave the ramp out",
+            figure=f"ramps start at step {listed(within)}, but the force leaves its plateau after step {found}",
+            advice="correct `start`, or leave it out: then it is found",
         )
-        for start in late
-    )
 
 
 def doubts_of_reference(found: Examination, experiment: Experiment) -> tuple[Doubt, ...]:

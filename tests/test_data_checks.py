@@ -157,3 +157,12 @@ def test_a_ramp_after_the_last_step_is_named():
     (found,) = doubts_of_time((Polynomial(), Ramp(start=500), Ramp(start=10), Ramp()), good().test)
     assert found.name == "ramp-start"
     assert "step 500" in found.figure
+
+
+def test_a_ramp_that_starts_elsewhere_than_the_loading_is_named():
+    """The force of the spheres leaves its plateau after step 10."""
+    for start in (3, 20):
+        (found,) = doubts_of_time((Ramp(start=start),), good().test)
+        assert found.name == "ramp-start"
+        assert "after step 10" in found.figure
+    assert not list(doubts_of_time((Ramp(start=9), Ramp(start=25)), good().test))  # one more event may follow
