@@ -19,6 +19,8 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 STEPS_AT_ONCE = 8
+MEMORY_SHARE = 0.5
+"""Of the free memory, what the unknowns may need: images and other work need some, too."""
 COPIES = 10
 """Matrices of all unknowns that are held at a time: Hessian, inverse, parts of the noise, their products."""
 
@@ -71,13 +73,13 @@ Linearise = Callable[[Floats], Equations]
 
 
 def check_size(time_functions: Floats, basis: SectionBasis) -> None:
-    """Raise ValueError where the equations and the covariance of all unknowns do not fit into memory."""
+    """Raise ValueError where the equations and the covariance of all unknowns need more than half of the memory."""
     functions, steps = time_functions.shape
     size = basis.shape[0] * basis.shape[1]
     joined = functions * size if np.count_nonzero(time_functions, axis=0).max() > 1 else size
     needed = 8 * (2 * steps * size**2 + COPIES * joined**2)
     free = psutil.virtual_memory().available
-    if needed > free:
+    if needed > MEMORY_SHARE * free:
         raise ValueError(
             f"sections, time: expected unknowns that fit into memory, got {functions} time functions of "
             f"{basis.shape[0]} sections with {basis.shape[1]} motions, which need {needed / 2**30:.1f} GiB where "

@@ -13,6 +13,7 @@ from pdvc.geometry import ConeBeam
 from pdvc.measurement import Measurement
 from pdvc.verdict import Doubt, Stop
 from pdvc.volume import Hull, Volume
+from pdvc.window import free_columns
 
 Floats = NDArray[np.float64]
 
@@ -32,6 +33,8 @@ FROM_DATA = 0.5
 FEW_STEPS = 3
 STILL_MOVES_VOXEL = 0.02
 """A last change as large as this, rms: what a good measurement errs by across the beam."""
+HULL_MARGIN_PX = 6.0
+"""Columns by which the hull's shadow is wider than the sample's: its margin, and a voxel of the coarse outline."""
 CUT_ROWS = 0.02
 """Share of the used rows whose rays may leave the volume through a cut end, at most, at any step."""
 STRENGTH_MPA = 5000.0
@@ -44,6 +47,7 @@ def doubts_of_result(found: Measurement, volume: Volume, geometry: ConeBeam, pri
         *_of_residuals(found),
         *_of_motion(found, prior_voxel, np.arange(len(found.amplitude))),
         *_of_ends(found, volume, geometry),
+        *_of_window(found, volume.hull, geometry),
         *_of_convergence(found),
         *_of_basis(found),
         *_of_force(found, volume.hull),
@@ -168,6 +172,17 @@ def _of_ends(found: Measurement, volume: Volume, geometry: ConeBeam) -> Iterator
             figure=f"rays of up to {share.max():.0%} of the used rows leave the volume through its cut ends",
             advice=f"leave out {more} rows more: discard_rows = {found.window[0] + more}",
             steps=tuple(over.tolist()),
+        )
+
+
+def _of_window(found: Measurement, hull: Hull, geometry: ConeBeam) -> Iterator[Doubt]:
+    low, high = found.basis.height_mm[[0, -1]]
+    cut = max(found.window[2], geometry.columns - found.window[3]) - free_columns(geometry, hull, low, high)
+    if cut > HULL_MARGIN_PX:
+        yield Doubt(
+            name="narrow-window",
+            figure=f"the used columns leave out {cut:.0f} px of the sample on a side",
+            advice="its edges tell most of motions across the beam: lower discard_columns",
         )
 
 

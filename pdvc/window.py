@@ -28,11 +28,11 @@ def used_window(geometry: ConeBeam, options: MeasureOptions, hull: Hull) -> tupl
         raise ValueError(f"rows: expected rays of some of {geometry.rows} rows to stay in the volume, found none")
     if columns is None:
         edges = [height_mm(geometry, row - 0.5) for row in (geometry.rows - rows, rows)]
-        columns = max(min(round(geometry.columns * USUAL_COLUMNS), int(_free_columns(geometry, hull, *edges))), 0)
+        columns = max(min(round(geometry.columns * USUAL_COLUMNS), int(free_columns(geometry, hull, *edges))), 0)
     return rows, geometry.rows - rows, columns, geometry.columns - columns
 
 
-def _free_columns(geometry: ConeBeam, hull: Hull, low_mm: float, high_mm: float) -> float:
+def free_columns(geometry: ConeBeam, hull: Hull, low_mm: float, high_mm: float) -> float:
     """Return the columns on either side that never see the sample between two heights, px."""
     bottom = hull.z_mm + hull.slab_mm * np.arange(len(hull.support_mm))
     support = hull.support_mm[(bottom + hull.slab_mm > low_mm) & (bottom < high_mm)]

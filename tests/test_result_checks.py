@@ -157,6 +157,11 @@ def test_the_rows_to_leave_out_are_enough():
     assert "cut-ends" not in doubts(narrower, volume(2.6))
 
 
+def test_a_window_that_leaves_out_the_sample_s_edges_is_named():
+    assert "narrow-window" in doubts(replace(GOOD, window=(10, 70, 18, 22), data_share=result().data_share))
+    assert "narrow-window" not in doubts(result())
+
+
 # Full scans, and the record
 
 
