@@ -118,6 +118,8 @@ def _short(value: object) -> str:
     """Return a value as it fits into a line of text."""
     if isinstance(value, dict):
         return f"a table of {len(value)} keys"
+    if isinstance(value, list) and any(isinstance(each, dict) for each in value):
+        return f"a list of {len(value)} tables"
     # whole numbers of thousands of digits have no text
     text = f"a number of {value.bit_length()} bits" if isinstance(value, int) and abs(value) >= 2**64 else repr(value)
     return text if len(text) < 80 else text[:77] + "..."

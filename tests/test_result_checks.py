@@ -158,8 +158,15 @@ def test_the_rows_to_leave_out_are_enough():
 
 
 def test_a_window_that_leaves_out_the_sample_s_edges_is_named():
-    assert "narrow-window" in doubts(replace(GOOD, window=(10, 70, 18, 22), data_share=result().data_share))
-    assert "narrow-window" not in doubts(result())
+    """Seen four times finer, half of the sample is some twenty columns wide."""
+    finer = replace(BEAM, pixel_mm=BEAM.pixel_mm / 4, rows=4 * BEAM.rows, columns=4 * BEAM.columns)
+
+    def names(left, right):
+        found = replace(result(), window=(40, 280, left, right))
+        return {each.name for each in doubts_of_result(found, volume(), finer, 30.0)}
+
+    assert "narrow-window" in names(72, 88)
+    assert "narrow-window" not in names(56, 104)
 
 
 # Full scans, and the record
