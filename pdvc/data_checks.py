@@ -10,13 +10,16 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdvc.examination import Examination, StackLook, examine, full_scale, with_angles
 from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, Experiment, ExperimentError, Series
 from pdvc.history import Ramp, TimeFunctions
-from pdvc.onset import onset
+from pdvc.onset import LEAST_PLATEAU, force_noise, onset
 from pdvc.progress import Progress, silent
 from pdvc.verdict import Doubt, listed
+
+Floats = NDArray[np.float64]
 
 AIR_ERROR, AIR_DOUBT = 0.3, 0.03
 """Departures of the air's transmission from 1 that are refused, and doubted."""
@@ -28,6 +31,10 @@ NOISE_FACTOR = 1.5
 """The variance between flats may differ by this factor from what the description says: flats are few, pixels many."""
 GAP_RAD = np.deg2rad(15.0)
 """Gap between reference views above which streaks are seen in the volume."""
+ONE_DIRECTION = 0.9
+"""Length of the mean of exp(2 i angle) above which all directions are within some 13 degrees (rms) of each other."""
+FORCE_CHANGES = 10.0
+"""Deviations of its noise by which a force changes that is not just noise."""
 ONSET_STEPS = 3
 """Steps between the start of a ramp and the onset of loading that no force noise explains."""
 FAN_TOLERANCE = 0.15
@@ -129,6 +136,8 @@ def doubts_of_time(parts: tuple[TimeFunctions, ...], series: Series) -> Iterator
                 figure=f"a ramp starts at step {start}, but the last step is {last}: it was left out",
                 advice="correct `start`, or leave the ramp out",
             )
+    if any(isinstance(part, Ramp) and part.start == "onset" for part in parts) and last > LEAST_PLATEAU:
+        yield from _of_onset(series.force_N)
     found, within = onset(series.force_N), [start for start in starts if start < last]
     if found is not None and within and min(abs(start - found) for start in within) > ONSET_STEPS:
         yield Doubt(
@@ -136,6 +145,19 @@ def doubts_of_time(parts: tuple[TimeFunctions, ...], series: Series) -> Iterator
             figure=f"ramps start at step {listed(within)}, but the force leaves its plateau after step {found}",
             advice="correct `start`, or leave it out: then it is found",
         )
+
+
+def _of_onset(force_N: Floats) -> Iterator[Doubt]:
+    """Tell of a force without an onset, but for one that was recorded and did not change."""
+    if onset(force_N) is not None or 0 < np.ptp(force_N) < FORCE_CHANGES * force_noise(force_N):
+        return
+    yield Doubt(
+        name="onset",
+        figure="the force does not leave a plateau of three steps or more"
+        if np.ptp(force_N)
+        else "no force was recorded",
+        advice="the ramp was left out: say at which step loading begins, `start` of the ramp among the time functions",
+    )
 
 
 def doubts_of_reference(found: Examination, experiment: Experiment) -> tuple[Doubt, ...]:
@@ -228,11 +250,14 @@ def _of_records(found: Examination, experiment: Experiment) -> Iterator[Doubt]:
             advice="are the steps in the order in which they were recorded?",
             steps=tuple(late.tolist()),
         )
-    if len(test) > 3 and found.onset is None and np.ptp(test.force_N) > 0:
+    # directions half a turn apart see the same: their doubled angles are compared
+    alike = float(np.abs(np.exp(2j * test.angle_rad).mean()))
+    if alike > ONE_DIRECTION and len(test) > 1:
         yield Doubt(
-            name="onset",
-            figure="the force does not leave a plateau of three steps or more",
-            advice="say at which step loading begins: `start` of the ramp among the time functions",
+            name="one-direction",
+            figure="all radiographs of the test look nearly the same way: their directions have a resultant of "
+            f"{alike:.2f}",
+            advice="motion along the beam is not known: turn the sample during the test",
         )
 
 

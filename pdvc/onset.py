@@ -28,7 +28,7 @@ def onset(force_N: Floats) -> int | None:
     None also where there is no plateau of three steps to leave: nothing then tells when loading began.
     """
     steps = len(force_N)
-    best, noise = None, _noise(force_N)
+    best, noise = None, force_noise(force_N)
     for first in range(LEAST_PLATEAU, steps - 2):
         plateau = force_N[:first]
         level = float(np.median(plateau))
@@ -47,8 +47,11 @@ def onset(force_N: Floats) -> int | None:
     return int(np.clip(found, 0, first - 1))
 
 
-def _noise(force_N: Floats) -> float:
-    """Return the noise, N, by second differences, from which a slope is absent; sigma^2 (1 + 4 + 1) is theirs."""
+def force_noise(force_N: Floats) -> float:
+    """Return the noise of a recorded force (step,), N, by second differences, from which a slope is absent.
+
+    Their variance is sigma^2 (1 + 4 + 1).
+    """
     bends = np.diff(force_N, 2)
     return 1.4826 * float(np.median(np.abs(bends))) / np.sqrt(6) if len(bends) else 0.0
 

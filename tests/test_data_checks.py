@@ -106,7 +106,7 @@ DOUBTED = {
         (11, 24, 25, 26, 27, 28, 29),
     ),
     "times": (with_test(good(), time_s=TEST.time_s[::-1]), tuple(range(1, 30))),
-    "onset": (with_test(good(), force_N=np.linspace(0, 100, 30)), ()),
+    "one-direction": (with_test(good(), angle_rad=0.05 * TEST.angle_rad), ()),
     "step-angle": (with_test(good(), counts=swapped(TEST.counts, 9, 20)), (9, 20)),
     "test-angles": (with_test(good(), angle_rad=-TEST.angle_rad), ()),
     "upside-down": (with_test(good(), counts=TEST.counts[:, ::-1]), ()),
@@ -157,6 +157,16 @@ def test_a_ramp_after_the_last_step_is_named():
     (found,) = doubts_of_time((Polynomial(), Ramp(start=500), Ramp(start=10), Ramp()), good().test)
     assert found.name == "ramp-start"
     assert "step 500" in found.figure
+
+
+def test_a_force_without_an_onset_is_named_where_a_ramp_waits_for_one():
+    steps = np.arange(30.0)
+    for force in (0 * steps, steps):
+        (found,) = doubts_of_time((Ramp(),), with_test(good(), force_N=force).test)
+        assert found.name == "onset"
+        assert not list(doubts_of_time((Ramp(start=10), Polynomial()), with_test(good(), force_N=force).test))
+    quiet = 250 + np.random.default_rng(0).normal(size=30)  # recorded, and nothing happened
+    assert not list(doubts_of_time((Ramp(),), with_test(good(), force_N=quiet).test))
 
 
 def test_a_ramp_that_starts_elsewhere_than_the_loading_is_named():

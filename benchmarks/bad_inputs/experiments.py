@@ -77,8 +77,9 @@ CASES = (
     ),
     BadInput(
         name="axis-nearer",
+        due="unknowable",
         experiment="small, axis nearer",
-        wrong="The axis stood 10 mm, of 29, nearer to the source than recorded.",
+        wrong="The axis stood 10 mm, of 29, nearer to the source than recorded: a larger sample shows the same.",
     ),
     BadInput(
         name="stage-stands",
@@ -91,9 +92,10 @@ CASES = (
         wrong="A square bar was seen along its flat faces in every radiograph of the test, a quarter turn apart.",
     ),
     BadInput(
-        name="flat-faces-along-beam",
+        name="flat-faces-at-some-angles",
+        due="good",
         experiment="small, flat faces",
-        wrong="A square bar was mounted with its flat faces along the beam at the start of each turn.",
+        wrong="Little: a square bar with flat faces along the beam at a few angles is measured as well as any.",
     ),
     BadInput(
         name="few-photons",

@@ -202,10 +202,10 @@ CONTROLS = (
         wrong="Nothing: the stage went on counting, two turns further.",
     ),
     BadInput(
-        name="good-no-force",
-        due="good",
+        name="no-force",
+        due="warning",
         change=in_turn(settled("reference", force_N=[0.0] * 75), settled("test", force_N=[0.0] * 127)),
-        wrong="Nothing: no force was recorded, and zeros stand for it, as the documents advise.",
+        wrong="No force was recorded, zeros stand for it, and the options do not say where loading starts.",
     ),
     BadInput(
         name="good-noise-unknown",
