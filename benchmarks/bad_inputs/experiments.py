@@ -141,7 +141,11 @@ CONTROLS = (
         wrong="Nothing: a test at constant force, to learn the noise floor.",
     ),
     BadInput(name="good-quick", due="good", experiment="quick", wrong="Nothing: `quick` as it is."),
-    BadInput(name="good-in-space", due="good", experiment="in-space", wrong="Nothing: `in-space` as it is."),
+    BadInput(
+        name="in-space",
+        experiment="in-space",
+        wrong="Hardly any noise: what interpolation leaves is more, and the standard deviations hold noise alone.",
+    ),
     BadInput(name="good-rigid", due="good", experiment="rigid", wrong="Nothing: `rigid` as it is."),
     BadInput(
         name="good-paper-protocol",
