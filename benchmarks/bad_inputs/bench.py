@@ -29,6 +29,8 @@ _PROGRESS = re.compile(r": \d+ of \d+ in [\d.]+ s$|^(measurement|report): ")
 _RAW = re.compile(r"^Traceback |:\d+: \w*Warning: ")
 _EXPLAINED = re.compile(r"expected|missing|unknown key|not valid TOML|truncated")
 """What every error of this software says: what was expected, or what is missing; and no dictionary of Python's."""
+LOST = 255
+"""What the server of processes says where it lost the exit code: then the command is given again."""
 MEASURED = (0, 3)
 """Exit codes with which a result was written; 3: its verdict is `failed`."""
 LARGE_STRAIN = 0.2
@@ -211,13 +213,16 @@ class Bench:
     def _command(self, arguments: list[str], log: Path) -> int | None:
         """Run the command line in a process of its own; returns its exit code, or None beyond the limit."""
         log.touch()  # a process that is stopped early has not opened it
-        process = self._processes.Process(target=_run, args=(arguments, str(log)), daemon=True)
-        process.start()
-        process.join(self._limit_s)
-        if process.is_alive():
-            process.kill()
-            process.join()
-            return None
+        for _ in range(3):
+            process = self._processes.Process(target=_run, args=(arguments, str(log)), daemon=True)
+            process.start()
+            process.join(self._limit_s)
+            if process.is_alive():
+                process.kill()
+                process.join()
+                return None
+            if process.exitcode != LOST:
+                break
         return process.exitcode
 
 
