@@ -128,7 +128,7 @@ def doubts_of_data(found: Examination, experiment: Experiment) -> tuple[Doubt, .
 def doubts_of_time(parts: tuple[TimeFunctions, ...], series: Series) -> Iterator[Doubt]:
     """Give what is wrong with time functions for the steps of a test."""
     starts = [part.start for part in parts if isinstance(part, Ramp) and isinstance(part.start, int)]
-    last = len(series) - 1
+    last, found = len(series) - 1, onset(series.force_N)
     for start in starts:
         if start >= last:
             yield Doubt(
@@ -137,8 +137,8 @@ def doubts_of_time(parts: tuple[TimeFunctions, ...], series: Series) -> Iterator
                 advice="correct `start`, or leave the ramp out",
             )
     if any(isinstance(part, Ramp) and part.start == "onset" for part in parts) and last > LEAST_PLATEAU:
-        yield from _of_onset(series.force_N)
-    found, within = onset(series.force_N), [start for start in starts if start < last]
+        yield from _of_onset(series.force_N, found)
+    within = [start for start in starts if start < last]
     if found is not None and within and min(abs(start - found) for start in within) > ONSET_STEPS:
         yield Doubt(
             name="ramp-start",
@@ -147,9 +147,9 @@ def doubts_of_time(parts: tuple[TimeFunctions, ...], series: Series) -> Iterator
         )
 
 
-def _of_onset(force_N: Floats) -> Iterator[Doubt]:
+def _of_onset(force_N: Floats, found: int | None) -> Iterator[Doubt]:
     """Tell of a force without an onset, but for one that was recorded and did not change."""
-    if onset(force_N) is not None or 0 < np.ptp(force_N) < FORCE_CHANGES * force_noise(force_N):
+    if found is not None or 0 < np.ptp(force_N) < FORCE_CHANGES * force_noise(force_N):
         return
     yield Doubt(
         name="onset",
@@ -168,7 +168,6 @@ def doubts_of_reference(found: Examination, experiment: Experiment) -> tuple[Dou
 
 def _of_counts(found: Examination) -> Iterator[Doubt]:
     for name, look in found.stacks.items():
-        of_test = name == TEST
         off = np.flatnonzero(np.abs(look.air - 1) > AIR_DOUBT)
         if len(off):
             worst = off[np.abs(look.air[off] - 1).argmax()]
@@ -176,7 +175,7 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 name="air-level",
                 figure=f"{name}: air has a transmission of {look.air[worst]:.3f} where 1 is due, in {len(off)} images",
                 advice="the beam changed, or flats and darks are not those of these radiographs",
-                steps=tuple(off.tolist()) if of_test else (),
+                steps=_steps(name, off),
             )
         clipped = np.flatnonzero(look.at_top > SATURATED) if _clips(look.highest, found) else np.zeros(0, dtype=int)
         if len(clipped):
@@ -184,7 +183,7 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 name="saturation",
                 figure=f"{name}: {look.at_top.max():.1%} of the pixels are at the largest count, {look.highest}",
                 advice="counts are clipped: expose shorter, or with fewer photons",
-                steps=tuple(clipped.tolist()) if of_test else (),
+                steps=_steps(name, clipped),
             )
         dark = np.flatnonzero(look.black > SATURATED)
         if len(dark):
@@ -192,17 +191,17 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 name="starvation",
                 figure=f"{name}: up to {look.black.max():.1%} of the pixels see no more than 2 % of the beam",
                 advice="nothing is measured behind them: more photons, a harder beam or a thinner sample",
-                steps=tuple(dark.tolist()) if of_test else (),
+                steps=_steps(name, dark),
             )
         flat = np.flatnonzero(look.steepest > STEEP)
-        if of_test and len(flat) > FLAT_SHARE * len(look.steepest):
+        if name == TEST and len(flat) > FLAT_SHARE * len(look.steepest):
             yield Doubt(
                 name="flat-faces",
                 figure=f"{name}: at {len(flat)} of {len(look.steepest)} steps attenuation rises by more than "
                 f"{STEEP:.0%} of its largest from one column to the next",
                 advice="flat faces lie along the beam, where edges are interpolated badly: turn the sample, or use "
                 "other angles",
-                steps=tuple(flat.tolist()),
+                steps=_steps(name, flat),
             )
         cut = np.flatnonzero(look.edge > 0.02)
         if len(cut):
@@ -210,7 +209,7 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 name="out-of-view",
                 figure=f"{name}: the sample covers a side of the detector in up to {look.edge.max():.0%} of the rows",
                 advice="the whole width of the sample has to be seen at every angle",
-                steps=tuple(cut.tolist()) if of_test else (),
+                steps=_steps(name, cut),
             )
     if found.flats_top > SATURATED and found.flats_full:
         yield Doubt(
@@ -231,6 +230,11 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
             figure=f"flats scatter with {ratio:.3g} times the variance that [acquisition] in {DESCRIPTION} tells",
             advice="correct photons_per_count, readout_noise_counts or frames: standard deviations follow them",
         )
+
+
+def _steps(name: str, images: NDArray[np.intp]) -> tuple[int, ...]:
+    """Return images of a stack as steps, where they are those of the test."""
+    return tuple(images.tolist()) if name == TEST else ()
 
 
 def _of_records(found: Examination, experiment: Experiment) -> Iterator[Doubt]:

@@ -72,12 +72,17 @@ Linearise = Callable[[Floats], Equations]
 """From trial amplitudes (step, section, motion) to the equations there."""
 
 
-def check_size(time_functions: Floats, basis: SectionBasis) -> None:
-    """Raise ValueError where the equations and the covariance of all unknowns need more than half of the memory."""
+def memory_bytes(time_functions: Floats, basis: SectionBasis) -> int:
+    """Return what the equations of all steps and the covariance of all unknowns need, about, bytes."""
     functions, steps = time_functions.shape
     size = basis.shape[0] * basis.shape[1]
     joined = functions * size if np.count_nonzero(time_functions, axis=0).max() > 1 else size
-    needed = 8 * (2 * steps * size**2 + COPIES * joined**2)
+    return int(8 * (2 * steps * size**2 + COPIES * joined**2))
+
+
+def check_size(time_functions: Floats, basis: SectionBasis) -> None:
+    """Raise ValueError where the equations and the covariance of all unknowns need more than half of the memory."""
+    functions, needed = len(time_functions), memory_bytes(time_functions, basis)
     free = psutil.virtual_memory().available
     if needed > MEMORY_SHARE * free:
         raise ValueError(

@@ -19,6 +19,7 @@ from pdvc.likeness import Likeness, likeness
 from pdvc.onset import onset
 from pdvc.progress import Progress, silent
 from pdvc.radiographs import Calibration, calibrate, detector_noise
+from pdvc.reconstruction import gaps_rad
 from pdvc.seen_twice import SeenTwice, seen_twice
 
 Floats = NDArray[np.float64]
@@ -103,7 +104,6 @@ def examine(experiment: Experiment, *, progress: Progress = silent) -> Examinati
         stacks[name] = _look(each.counts, calibration)
         done += len(each)
         progress("examine", done, total)
-    angle = np.sort(np.mod(experiment.reference.angle_rad, 2 * np.pi))
     return Examination(
         calibration=calibration,
         stacks=stacks,
@@ -111,7 +111,7 @@ def examine(experiment: Experiment, *, progress: Progress = silent) -> Examinati
         flats_full=full_scale(int(experiment.flats.max())),
         bad_share=float(calibration.bad.mean()),
         noise_ratio=_noise_ratio(experiment, calibration),
-        largest_gap_rad=float(np.diff(np.append(angle, angle[0] + 2 * np.pi)).max()),
+        largest_gap_rad=float(gaps_rad(np.sort(np.mod(experiment.reference.angle_rad, 2 * np.pi))).max()),
         repeated=_repeated(experiment),
         onset=onset(experiment.test.force_N),
         seen_twice=None,

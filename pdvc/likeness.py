@@ -60,20 +60,21 @@ def likeness(experiment: Experiment, calibration: Calibration) -> Likeness:
     bins = max(1, round(min(geometry.rows / ROWS, geometry.columns / 40)))
     near = neighbouring_views(reference.angle_rad, test.angle_rad)
     nearest = np.where(near.share > 0.5, near.second, near.first)
+    few = calibration.binned(bins)
     compare = _Compare((geometry.rows // bins, geometry.columns // bins))
     own, place = np.unique(nearest, return_inverse=True)
-    views = compare.prepared(_images(reference.counts, calibration, bins, own))
-    steps = compare.prepared(_images(test.counts, calibration, bins, np.arange(len(test))))
+    views = compare.prepared(_images(reference.counts, few, bins, own))
+    steps = compare.prepared(_images(test.counts, few, bins, np.arange(len(test))))
     recorded = np.array([compare.pair(steps[t], views[v]) for t, v in enumerate(place)])
     looked_at = np.union1d(
         np.linspace(0, len(test) - 1, min(EVENLY, len(test))).astype(np.int64), np.argsort(recorded)[:LEAST_LIKE]
     )
     around = np.unique(np.linspace(0, len(reference), min(VIEWS, len(reference)), endpoint=False).astype(np.int64))
-    all_around = compare.prepared(_images(reference.counts, calibration, bins, around))
+    all_around = compare.prepared(_images(reference.counts, few, bins, around))
 
     def with_all(counts: NDArray[np.uint16]) -> Floats:
         """Return correlations (looked at, 1 + view) with the view at the recorded angle, and with all around."""
-        spectra = compare.prepared(_images(counts, calibration, bins, looked_at))
+        spectra = compare.prepared(_images(counts, few, bins, looked_at))
         return np.array(
             [
                 [compare.pair(one, view) for view in (views[place[t]], *all_around)]
@@ -95,8 +96,8 @@ def likeness(experiment: Experiment, calibration: Calibration) -> Likeness:
     )
 
 
-def _images(counts: NDArray[np.uint16], calibration: Calibration, bins: int, which: NDArray[np.int64]) -> Image:
-    few = calibration.binned(bins)
+def _images(counts: NDArray[np.uint16], few: Calibration, bins: int, which: NDArray[np.int64]) -> Image:
+    """Return images (which, row, column), binned before their logarithm; `few` is the calibration of such pixels."""
     return np.stack([grey_levels(binned(counts[k], bins), few) for k in which])
 
 

@@ -74,6 +74,11 @@ def fdk(
     return framed(np.ascontiguousarray(result.transpose(2, 0, 1)))
 
 
+def gaps_rad(turned_rad: Floats) -> Floats:
+    """Return the gaps (angle,) from each of the increasing angles of a turn to the next, over the turn's end too."""
+    return np.diff(np.append(turned_rad, turned_rad[0] + 2 * np.pi))
+
+
 def angular_share(angle_rad: Floats) -> Floats:
     """Return dtheta_i / 2: half the turn that each view stands for, from the gaps to its neighbours.
 
@@ -81,7 +86,7 @@ def angular_share(angle_rad: Floats) -> Floats:
     """
     turned = np.mod(angle_rad, 2 * np.pi)
     unique, inverse, count = np.unique(np.round(turned, 9), return_inverse=True, return_counts=True)
-    gaps = np.diff(np.append(unique, unique[0] + 2 * np.pi))
+    gaps = gaps_rad(np.asarray(unique, dtype=np.float64))
     if len(unique) < 3 or gaps.max() > LARGEST_GAP_RAD:
         raise ValueError(
             "angles of a full scan: expected a full turn without gaps above "

@@ -13,7 +13,7 @@ from pdvc.geometry import ConeBeam
 from pdvc.measurement import Measurement
 from pdvc.verdict import Doubt, Stop
 from pdvc.volume import Hull, Volume
-from pdvc.window import free_columns
+from pdvc.window import free_columns, kept_heights_mm
 
 Floats = NDArray[np.float64]
 
@@ -188,11 +188,8 @@ def _of_window(found: Measurement, hull: Hull, geometry: ConeBeam) -> Iterator[D
 
 def cut_rows(found: Measurement, volume: Volume, geometry: ConeBeam) -> Floats:
     """Return the share of used rows (step,) whose rays, moved back, leave the volume where it is cut in height."""
-    low, high = volume.hull.box_mm()
-    radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
-    grid = volume.grid
-    # projection.py ends rays at the first layer but one
-    bottom, top = grid.origin_mm[2] + grid.voxel_mm * np.array([1, grid.shape[0] - 2])
+    radius = volume.hull.radius_mm()
+    bottom, top = kept_heights_mm(volume.grid)
     row = np.arange(found.window[0], found.window[1]) - (geometry.rows - 1) / 2
     rise = -(row * geometry.pixel_mm + geometry.row_shift_mm) / geometry.source_detector_mm
     reach = np.stack([rise * (geometry.source_axis_mm - radius), rise * (geometry.source_axis_mm + radius)])
@@ -230,9 +227,8 @@ def _of_basis(found: Measurement) -> Iterator[Doubt]:
 def _of_force(found: Measurement, hull: Hull) -> Iterator[Doubt]:
     filled = hull.support_mm[np.isfinite(hull.support_mm).all(axis=1)]
     half = filled.shape[1] // 2
-    area = float(
-        (filled[:, :half] + filled[:, half:]).min() ** 2
-    )  # of a square as wide as the hull where it is thinnest
+    # of a square as wide as the hull where that is thinnest
+    area = float((filled[:, :half] + filled[:, half:]).min() ** 2)
     stress = float(np.abs(found.force_N).max()) / area
     if stress > STRENGTH_MPA:
         yield Doubt(

@@ -21,6 +21,7 @@ from scipy import optimize
 from pdvc.experiment import Series
 from pdvc.geometry import ConeBeam
 from pdvc.radiographs import Calibration, binned, grey_levels
+from pdvc.reconstruction import gaps_rad
 
 Floats = NDArray[np.float64]
 
@@ -67,8 +68,7 @@ def seen_twice(series: Series, geometry: ConeBeam, calibration: Calibration) -> 
     """
     angle = np.mod(series.angle_rad, 2 * np.pi)
     order = np.argsort(angle, kind="stable")
-    gaps = np.diff(np.append(angle[order], angle[order[0]] + 2 * np.pi))
-    if len(series) < LEAST_VIEWS or gaps.max() > 3 * np.pi / LEAST_VIEWS:
+    if len(series) < LEAST_VIEWS or gaps_rad(angle[order]).max() > 3 * np.pi / LEAST_VIEWS:
         return None
     bins = max(1, round(geometry.columns / COLUMNS))
     coarse = geometry.binned(bins)

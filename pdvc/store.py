@@ -35,7 +35,7 @@ class Store:
     def __init__(self, folder: Path | None, experiment: Experiment) -> None:
         self._folder = folder
         self._reference = reference_digest(experiment) if folder else ""
-        self._whole = experiment_digest(experiment) if folder else ""
+        self._whole = _whole(self._reference, experiment) if folder else ""
 
     def arrays(self, name: str, depends: tuple[Any, ...], make: Callable[[], Arrays]) -> Arrays:
         """Return what `make` makes of the experiment and of what else it `depends` on; read where it was kept."""
@@ -76,26 +76,22 @@ def _read(path: Path) -> Arrays | None:
 
 def reference_digest(experiment: Experiment) -> str:
     """Return a digest of the software and of all that a reconstruction of the reference scan may depend on."""
-    return digest(software("pdvc"), *_scanner(experiment), experiment.reference)
-
-
-def experiment_digest(experiment: Experiment) -> str:
-    """Return a digest of the software and of all of an experiment but its title and material."""
     return digest(
         software("pdvc"),
-        *_scanner(experiment),
-        experiment.reference,
-        experiment.test,
-        tuple(experiment.interrupted),
-    )
-
-
-def _scanner(experiment: Experiment) -> tuple[Any, ...]:
-    return (
         experiment.geometry,
         experiment.frames,
         experiment.photons_per_count,
         experiment.readout_noise_counts,
         experiment.flats,
         experiment.darks,
+        experiment.reference,
     )
+
+
+def experiment_digest(experiment: Experiment) -> str:
+    """Return a digest of the software and of all of an experiment but its title and material."""
+    return _whole(reference_digest(experiment), experiment)
+
+
+def _whole(reference: str, experiment: Experiment) -> str:
+    return digest(reference, experiment.test, experiment.interrupted)

@@ -56,6 +56,11 @@ class Hull:
         high = [support[0], support[quarter], self.z_mm + (filled[-1] + 1) * self.slab_mm]
         return np.array(low), np.array(high)
 
+    def radius_mm(self) -> float:
+        """Return the distance of the farthest corner of its box from the axis, mm."""
+        low, high = self.box_mm()
+        return float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
+
 
 def hull_of(inside: NDArray[np.bool_], grid: Grid, slab_voxels: int) -> Hull:
     """Return the hull of the voxels that are inside (z, y, x), their whole area included."""

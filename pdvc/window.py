@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdvc.geometry import ConeBeam
 from pdvc.options import MeasureOptions
 from pdvc.reconstruction import seen_half_height_mm
 from pdvc.volume import Grid, Hull
+
+Floats = NDArray[np.float64]
 
 USUAL_ROWS, USUAL_COLUMNS = 100 / 954, 60 / 432
 """Shares of the rows and columns that are left out on each side, as in the paper."""
@@ -51,8 +54,7 @@ def height_mm(geometry: ConeBeam, row: float) -> float:
 def scan_grid(geometry: ConeBeam, hull: Hull) -> Grid:
     """Return the voxels that a scan is reconstructed on: around the hull, as high as every view sees."""
     low, high = hull.box_mm()
-    radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
-    reach = seen_half_height_mm(geometry, radius)
+    reach = seen_half_height_mm(geometry, hull.radius_mm())
     # two voxels of air around the hull keep interpolation, and its gradient, inside the grid
     margin = np.full(3, 2 * geometry.voxel_mm)
     low, high = low - margin, high + margin
@@ -60,12 +62,14 @@ def scan_grid(geometry: ConeBeam, hull: Hull) -> Grid:
     return Grid.around(low, high, geometry.voxel_mm)
 
 
+def kept_heights_mm(grid: Grid) -> Floats:
+    """Return the heights (2,), mm, between which rays are summed: from the first layer but one to the last but one."""
+    return np.asarray(grid.origin_mm[2] + grid.voxel_mm * np.array([1, grid.shape[0] - 2]))
+
+
 def reached_rows(geometry: ConeBeam, grid: Grid, hull: Hull) -> slice:
     """Return the rows whose rays stay within the grid's height where they cross the sample."""
-    low, high = hull.box_mm()
-    radius = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
-    # projection.py ends rays at the first layer but one
-    z = grid.origin_mm[2] + grid.voxel_mm * np.array([1, grid.shape[0] - 2])
-    down = -z * geometry.source_detector_mm / (geometry.source_axis_mm + radius) - geometry.row_shift_mm
+    z = kept_heights_mm(grid)
+    down = -z * geometry.source_detector_mm / (geometry.source_axis_mm + hull.radius_mm()) - geometry.row_shift_mm
     rows = down / geometry.pixel_mm + (geometry.rows - 1) / 2
     return slice(max(int(np.ceil(rows[1])) + 1, 0), min(int(np.floor(rows[0])), geometry.rows))

@@ -108,7 +108,7 @@ def study(
     """
     with answering(resume="give the same command again to go on from here") as progress:
         from pdvc.lock import held
-        from validation.paired import counted
+        from validation.paired import doubted
         from validation.runs import run_trials
         from validation.study import Study, study_file, trials_of
         from validation.study_report import machine, write_study_report
@@ -131,9 +131,9 @@ def study(
     failed = int((table["status"] != "done").sum())
     if failed:
         tell(f"{failed} of {len(table)} runs failed: see the reasons in {page}, or {out / 'failed'}")
-    doubted = int((table["verdict"].dropna() != "trusted").sum())
-    if doubted:
-        tell(f"{doubted} of {len(table)} measurements are doubted: {counted(table['doubts'].dropna())}")
+    number, reasons = doubted(table)
+    if number:
+        tell(f"{number} of {len(table)} measurements are doubted: {reasons}")
     tell(f"report: {page}")
 
 

@@ -10,6 +10,7 @@ import psutil
 
 from pdvc.compilation import compile_kernels
 from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
+from pdvc.equations import memory_bytes
 from pdvc.examination import Examination
 from pdvc.experiment import REFERENCE, TEST, Experiment
 from pdvc.history import time_basis, with_onset
@@ -96,13 +97,14 @@ def _cost(
     # the outline took two coarse reconstructions of some 150 views; scale 1 has more of both
     rows = min(geometry.rows, 240)
     finer = (geometry.rows / rows) ** 3 * len(reference) / min(len(reference), 150)
-    unknowns = len(time_basis(options.time, experiment.test)) * basis.shape[0] * basis.shape[1]
-    size = basis.shape[0] * basis.shape[1]
+    time_functions = time_basis(options.time, experiment.test)
     pixels = float(geometry.rows * geometry.columns)
     memory = 8 * voxels + 4 * pixels * len(reference) / 2 + 24 * steps * target.size
-    memory += 8 * (2 * steps * size**2 + 10 * unknowns**2)
+    memory += memory_bytes(time_functions, basis)
     return Cost(
-        seconds=pass_s * passes + outlining_s * (1 + finer / 2), memory_gib=memory / 2**30 + 0.3, unknowns=unknowns
+        seconds=pass_s * passes + outlining_s * (1 + finer / 2),
+        memory_gib=memory / 2**30 + 0.3,
+        unknowns=len(time_functions) * basis.shape[0] * basis.shape[1],
     )
 
 

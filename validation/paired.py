@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,9 @@ from validation.axis import TruePoints, axis_history
 from validation.intervals import Estimate, bootstrapped, mean, rms
 from validation.runs import ERRORS, Scalar
 from validation.scores import point_errors
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -249,6 +253,11 @@ def _scores(scenario: str, method: str, group: _Group) -> MethodScores:
         error=_estimates([group.common(method, each) for each in repetitions], rms),
         own_error=_estimates([group.own(method, each) for each in repetitions], rms),
     )
+
+
+def doubted(table: pd.DataFrame) -> tuple[int, str]:
+    """Return how many measurements of a table are not trusted by their own checks, and `counted` reasons."""
+    return int((table["verdict"].dropna() != "trusted").sum()), counted(table["doubts"].dropna())
 
 
 def counted(doubts: Iterable[str]) -> str:

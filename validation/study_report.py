@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from validation.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
-from validation.paired import counted
+from validation.paired import doubted
 from validation.runs import FAILED
 from validation.study import Study
 from validation.study_figures import study_pictures
@@ -85,14 +85,15 @@ def _page(
     failed = table[table["status"] != "done"]
     factors = [factor.column for factor in study.factor]
     columns = [*factors, "repetition", "reason", "key"]
+    number, reasons = doubted(table)
     return environment.get_template("study.html").render(
         study=study,
         text=text,
         runs=len(table),
         failed=[[_cell(row[name]) for name in columns] for _, row in failed.iterrows()],
         failed_columns=columns,
-        doubted=int((table["verdict"].dropna() != "trusted").sum()),
-        doubts=counted(table["doubts"].dropna()),
+        doubted=number,
+        doubts=reasons,
         failed_folder=FAILED,
         factors=[factor.axis_label for factor in study.factor],
         parts=PARTS,
