@@ -17,7 +17,7 @@ from pdvc.sections import RIGID
 from simulator.scanner import simulate
 from simulator.scenario import load_scenario
 from simulator.truth import read_truth
-from validation.scores import score
+from validation.scoring.scores import score
 
 DEFAULT = MeasureOptions()
 CHOICES = {

@@ -20,11 +20,11 @@ from pdvc.measure import measure
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.sections import RIGID
 from simulator.scenario import load_scenario
-from validation.bound import bound_of
-from validation.calibration import calibration
-from validation.scores import point_errors
-from validation.summary import estimates
-from validation.trial import simulated
+from validation.batch.trial import simulated
+from validation.scoring.bound import bound_of
+from validation.scoring.interval_calibration import interval_calibration
+from validation.scoring.scores import point_errors
+from validation.study.summary import estimates
 
 DRAWS = 10
 DIRECT = StageOptions(solver="gauss-newton", most=12, least_change_voxel=2e-4)
@@ -54,7 +54,7 @@ def main() -> None:
                     found = measure(experiment, OPTIONS)
                     errors.append(point_errors(found, truth).components)
                     sources.append(found.std_by_source)
-                    stated.append(asdict(calibration(found, truth, errors[-1]).predicted))
+                    stated.append(asdict(interval_calibration(found, truth, errors[-1]).predicted))
             least = asdict(bound.quantities(truth))
             for k, direction in enumerate(("across_beam", "vertical", "along_beam")):
                 predicted = np.sqrt(np.mean([each[direction] ** 2 for each in stated]))

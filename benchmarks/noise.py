@@ -14,7 +14,7 @@ from pdvc.measure import MeasureOptions, measure
 from simulator.scanner import simulate
 from simulator.scenario import Scenario, load_scenario
 from simulator.truth import read_truth
-from validation.scores import score
+from validation.scoring.scores import score
 
 CASES = (
     (1e3, 150, 1),

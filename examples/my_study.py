@@ -10,10 +10,10 @@ import sys
 import tomllib
 from pathlib import Path
 
-from validation.runs import run_trials
-from validation.small_cases import small_options, small_scenario
-from validation.study import Study, trials_of
-from validation.study_report import write_study_report
+from validation.batch.engine import run_trials
+from validation.study.description import Study, trials_of
+from validation.study.page import write_study_report
+from validation.testing.small_cases import small_options, small_scenario
 
 STUDY = """
 name = "photons"

@@ -15,8 +15,8 @@ from pdvc.measure import measure
 from pdvc.measurement import write_measurement
 from simulator.scanner import simulate
 from simulator.truth import read_truth
-from validation.scores import score
-from validation.small_cases import small_options, small_scenario
+from validation.scoring.scores import score
+from validation.testing.small_cases import small_options, small_scenario
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "out/one")
 

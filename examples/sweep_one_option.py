@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from pdvc.measure import measure
-from validation.scores import score
-from validation.small_cases import SmallExperiment, small_scenario
+from validation.scoring.scores import score
+from validation.testing.small_cases import SmallExperiment, small_scenario
 
 small = SmallExperiment(small_scenario({"seed": 1}))
 

@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from validation.axis import axis_history
-from validation.small_cases import SmallExperiment
-from validation.strategies import cone_beams, scenarios
+from validation.scoring.centre_line import centre_line
+from validation.testing.small_cases import SmallExperiment
+from validation.testing.strategies import cone_beams, scenarios
 
 
 @given(cone_beams(), st.integers(1, 6))
@@ -30,5 +30,5 @@ def never_loaded(scenario):
 @given(scenarios(least_ingredients=2).map(never_loaded).map(SmallExperiment))
 def test_a_sample_that_is_not_loaded_does_not_stretch(small):
     """Sections are some 15 voxels apart: a strain of a hundredth is 0.15 voxel between two of them."""
-    axis = axis_history(small.measurement)
-    assert np.abs(axis.strain(axis.measured)).max() < 0.01
+    centre = centre_line(small.measurement)
+    assert np.abs(centre.strain(centre.measured)).max() < 0.01

@@ -29,7 +29,7 @@ from pdvc.options import MeasureOptions, StageOptions, resolved
 from pdvc.preparation import Prepared, bases, calibrated, noise_of, prepare, snr_of
 from pdvc.prior import Prior
 from pdvc.progress import Progress, silent
-from pdvc.result_checks import doubts_of_result
+from pdvc.result_checks import check_finite, doubts_of_result
 from pdvc.sections import SectionBasis
 from pdvc.solution import Solution
 from pdvc.store import Store
@@ -63,9 +63,12 @@ def measure(
     with explained_by(doubts):
         found, volume = _measured(experiment, options, Store(work, experiment), progress)
     after = doubts_of_result(found, volume, experiment.geometry, options.prior_voxel)
+    verdict = Verdict(doubts=(*doubts, *after))
+    with explained_by(verdict.doubts):
+        check_finite(found)
     return replace(
         found,
-        verdict=Verdict(doubts=(*doubts, *after)),
+        verdict=verdict,
         seconds={"compile": compiling, "examine": examining, **found.seconds},
     )
 

@@ -236,3 +236,21 @@ def _of_force(found: Measurement, hull: Hull) -> Iterator[Doubt]:
             figure=f"the largest force makes {stress:.3g} MPa in the thinnest section",
             advice="test.force_N is in N: check its unit",
         )
+
+
+def check_finite(measurement: Measurement) -> None:
+    """Raise ValueError where a number of a measurement is not finite that a reader would take for measured."""
+    seen = measurement.observed
+    numbers: dict[str, NDArray[np.floating]] = {
+        "displacements": measurement.amplitude[:, seen],
+        "standard deviations": measurement.amplitude_std[:, seen],
+        "covariances": measurement.covariance,
+        "residuals": measurement.residual_final,
+        "SNR": np.stack([measurement.snr_initial_db, measurement.snr_rigid_db, measurement.snr_final_db]),
+    }
+    wrong = [name for name, values in numbers.items() if not np.isfinite(values).all()]
+    if wrong:
+        raise ValueError(
+            f"measurement: expected finite numbers, found others among {', '.join(wrong)}: the radiographs cannot be "
+            "measured with these options"
+        )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from validation.cli import app
-from validation.methods import GROUP
+from validation.methods.registry import GROUP
 
 
 def pdvc_bench(*arguments):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from validation.runs import Part, Result, Scalar
+from validation.batch.engine import Part, Result, Scalar
 
 
 def note(folder: Path, line: str) -> None:

@@ -16,7 +16,7 @@ from pdvc.projection import project
 from pdvc.rays import ray_vectors
 from pdvc.sections import SectionBasis
 from pdvc.volume import Grid, Volume
-from validation.small_cases import hull_around, placed_volume, textured_volume
+from validation.testing.small_cases import hull_around, placed_volume, textured_volume
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests import synthetic_records as records
-from validation.axis_deviation import axis_deviation
+from validation.scoring.deviations import centre_line_deviation
 
 
 @pytest.fixture(scope="module")
@@ -19,34 +19,34 @@ def case():
 
 def test_at_a_section_only_that_section_takes_part(case):
     measurement, _ = case
-    axis = axis_deviation(measurement)
+    centre = centre_line_deviation(measurement)
     # white covariance of the coefficients: a step's variance is that times the squares of its functions
     expected = np.sqrt(4e-4 / records.STEPS * (measurement.time_functions**2).sum(axis=0))
-    np.testing.assert_allclose(axis.std, np.broadcast_to(expected[:, None, None], axis.std.shape))
+    np.testing.assert_allclose(centre.std, np.broadcast_to(expected[:, None, None], centre.std.shape))
     length = np.diff(records.HEIGHT_MM) / records.VOXEL_MM
-    np.testing.assert_allclose(axis.strain_std, np.sqrt(2) * expected[:, None] / length)
-    assert axis.error is None
-    assert axis.strain_error is None
+    np.testing.assert_allclose(centre.strain_std, np.sqrt(2) * expected[:, None] / length)
+    assert centre.error is None
+    assert centre.strain_error is None
 
 
 def test_an_error_turns_with_the_beam(case):
     measurement, truth = case
     wrong = measurement.amplitude.copy()
     wrong[..., 0] += 0.3
-    axis = axis_deviation(replace(measurement, amplitude=wrong), truth)
-    turn = measurement.angle_rad[:, None] + np.zeros(len(axis.level_mm))
-    seen = np.isfinite(axis.error[..., 0])
-    np.testing.assert_allclose(axis.error[..., 0][seen], -0.3 * np.sin(turn)[seen], atol=1e-9)
-    np.testing.assert_allclose(axis.error[..., 1][seen], 0, atol=1e-9)
-    np.testing.assert_allclose(axis.error[..., 2][seen], 0.3 * np.cos(turn)[seen], atol=1e-9)
-    np.testing.assert_allclose(axis.strain_error[np.isfinite(axis.strain_error)], 0, atol=1e-9)
+    centre = centre_line_deviation(replace(measurement, amplitude=wrong), truth)
+    turn = measurement.angle_rad[:, None] + np.zeros(len(centre.level_mm))
+    seen = np.isfinite(centre.error[..., 0])
+    np.testing.assert_allclose(centre.error[..., 0][seen], -0.3 * np.sin(turn)[seen], atol=1e-9)
+    np.testing.assert_allclose(centre.error[..., 1][seen], 0, atol=1e-9)
+    np.testing.assert_allclose(centre.error[..., 2][seen], 0.3 * np.cos(turn)[seen], atol=1e-9)
+    np.testing.assert_allclose(centre.strain_error[np.isfinite(centre.strain_error)], 0, atol=1e-9)
 
 
 def test_errors_drawn_from_the_covariance_scatter_as_predicted(case):
     measurement, truth = case
     rng = np.random.default_rng(12)
-    predicted = axis_deviation(measurement, truth)
-    draws = [axis_deviation(records.drawn(measurement, rng), truth) for _ in range(60)]
+    predicted = centre_line_deviation(measurement, truth)
+    draws = [centre_line_deviation(records.drawn(measurement, rng), truth) for _ in range(60)]
     for errors, std in (
         (np.stack([draw.error for draw in draws]), predicted.std),
         (np.stack([draw.strain_error for draw in draws]), predicted.strain_std),

@@ -14,9 +14,9 @@ from pdvc.options import MeasureOptions
 from simulator.scanner import simulate
 from tests import synthetic_records as records
 from tests.tiny_scenarios import trial
-from validation.bound import bound_of
-from validation.calibration import calibration, true_coefficients
-from validation.scores import point_errors
+from validation.scoring.bound import bound_of
+from validation.scoring.interval_calibration import interval_calibration, true_coefficients
+from validation.scoring.scores import point_errors
 
 SECTIONS, MOTIONS, FUNCTIONS = 4, 6, 3
 
@@ -84,7 +84,7 @@ def test_errors_drawn_from_the_covariance_are_covered_as_they_should_be():
     found = []
     for _ in range(60):
         one = records.drawn(exact, rng)
-        found.append(calibration(one, truth, point_errors(one, truth).components))
+        found.append(interval_calibration(one, truth, point_errors(one, truth).components))
     for level, part in ((0.5, "coverage_50"), (0.9, "coverage_90"), (0.95, "coverage_95")):
         for name in ("across_beam", "vertical", "along_beam", "strain"):
             each = np.array([getattr(getattr(one, part), name) for one in found])
@@ -101,7 +101,7 @@ def test_an_interval_half_as_wide_as_due_shows():
     exact = known_motion(rng)
     truth = truth_of(exact)
     bold = [replace(records.drawn(exact, rng), covariance=exact.covariance / 4) for _ in range(20)]
-    found = [calibration(one, truth, point_errors(one, truth).components) for one in bold]
+    found = [interval_calibration(one, truth, point_errors(one, truth).components) for one in bold]
     assert np.sqrt(np.mean([one.z_rms.vertical**2 for one in found])) == pytest.approx(2, rel=0.2)
     assert np.mean([one.coverage_95.vertical for one in found]) < 0.8
     assert np.mean([one.nees for one in found]) > 3 * FUNCTIONS * SECTIONS * MOTIONS
@@ -115,7 +115,7 @@ def test_no_standard_deviation_that_is_predicted_is_below_the_bound(tmp_path):
     simulate(one.scenario, tmp_path / "experiment", clean=clean)
     measured = measure(read_experiment(tmp_path / "experiment"), one.options)
     np.testing.assert_allclose(measured.basis.height_mm, bound.basis.height_mm, rtol=1e-6)
-    predicted = calibration(measured, truth, point_errors(measured, truth).components).predicted
+    predicted = interval_calibration(measured, truth, point_errors(measured, truth).components).predicted
     least = bound.quantities(truth)
     for name in ("across_beam", "vertical", "strain"):
         assert getattr(predicted, name) > getattr(least, name), name

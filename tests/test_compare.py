@@ -14,13 +14,13 @@ from pdvc.settings import SettingsError
 from simulator.scenario import Scenario
 from tests.command_line import install, only_line, pdvc_bench
 from tests.tiny_scenarios import TINY
-from validation.compare import Comparison, with_scans
-from validation.compare_figures import Point, cost_figure, draw_cost, draw_steps, steps_figure, style_of
-from validation.compare_tables import TextTable, number, with_bounds, with_interval
-from validation.figures import new_figure
-from validation.intervals import Estimate
-from validation.methods import Method, looks_at_volumes
-from validation.paired import QUANTITIES
+from validation.compare.comparison import Comparison, with_scans
+from validation.compare.figures import Point, cost_figure, draw_cost, draw_steps, steps_figure, style_of
+from validation.compare.paired import QUANTITIES
+from validation.compare.tables import TextTable, number, with_bounds, with_interval
+from validation.methods.registry import Method, looks_at_volumes
+from validation.report.figures import new_figure
+from validation.scoring.bootstrap import Estimate
 
 SMALL = TINY.replace("reference_views = 60", "reference_views = 36").replace("test_steps = 25", "test_steps = 14")
 
@@ -216,7 +216,7 @@ import numpy as np
 
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.measure import measure
-from validation.methods import looks_at_volumes
+from validation.methods.registry import looks_at_volumes
 
 OPTIONS = MeasureOptions(
     sections=4,

@@ -5,7 +5,7 @@ import pytest
 
 from pdvc.experiment import Experiment, InterruptedScan, Series
 from simulator.scenario import course_of, load_scenario
-from validation.cost import cost_of_projections, cost_of_stack, cost_of_volumes
+from validation.methods.cost import cost_of_projections, cost_of_stack, cost_of_volumes
 
 
 def series(time_s):

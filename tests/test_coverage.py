@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from validation.coverage import DIRECTIONS, coverage_table, honesty, verdict
-from validation.study import Study
+from validation.study.coverage import DIRECTIONS, coverage_table, honesty, verdict
+from validation.study.description import Study
 
 UNKNOWNS, DRAWS, POINTS = 200, 80, 40
 STUDY = Study(name="made-up", repetitions=DRAWS)

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from tests.command_line import install
-from validation.methods import GROUP, find_method
-from validation.scores import score
-from validation.small_cases import SmallExperiment, small_scenario
+from validation.methods.registry import GROUP, find_method
+from validation.scoring.scores import score
+from validation.testing.small_cases import SmallExperiment, small_scenario
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

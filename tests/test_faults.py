@@ -22,7 +22,7 @@ from pdvc.lock import HOLDER, LOCK, InUseError, held
 from pdvc.options import MeasureOptions
 from simulator.scenario import load_scenario
 from tests.command_line import only_line, pdvc_bench
-from validation.run import Job, run
+from validation.job import Job, run
 
 FEW = MeasureOptions.parse(
     {
@@ -48,7 +48,7 @@ def whole(tmp_path_factory):
 def done(folder):
     """Do the job in a folder, without drawing; return its scores, without those that no two runs share."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("validation.run.write_report", lambda *_, **__: folder / "report.html")
+        patch.setattr("validation.job.write_report", lambda *_, **__: folder / "report.html")
         outcome = run(Job(scenario=load_scenario(SCENARIO), options=FEW, folder=folder, workers=1))
     scores = json.loads((folder / "scores.json").read_text())
     return {name: value for name, value in scores.items() if name not in TIMES}, outcome.reused

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests import synthetic_records as records
-from validation import figures
-from validation.axis import axis_history
-from validation.axis_deviation import axis_deviation
-from validation.scores import point_errors
+from validation.report import figures
+from validation.scoring.centre_line import centre_line
+from validation.scoring.deviations import centre_line_deviation
+from validation.scoring.scores import point_errors
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def test_scale_of_an_empty_residual_is_one():
 def test_translations_are_those_of_the_record(case):
     measurement, truth = case
     _, (ax,) = figures.new_figure(7, 3)
-    axis = axis_history(measurement, truth)
-    figures.draw_translations(axis, ax)
+    centre = centre_line(measurement, truth)
+    figures.draw_translations(centre, ax)
     drawn = [line.get_ydata() for line in ax.lines]
     np.testing.assert_allclose(drawn[:3], drawn[3:], atol=1e-9)
 
@@ -57,8 +57,8 @@ def test_force_marks_the_selected_steps(case):
 
 def test_difference_maps_vanish_for_a_perfect_measurement_and_hide_the_unobserved(case):
     measurement, truth = case
-    axis = axis_history(measurement, truth)
-    for figure in figures.stretch_maps(axis):
+    centre = centre_line(measurement, truth)
+    for figure in figures.stretch_maps(centre):
         difference = figure.axes[2].collections[0].get_array()
         assert np.ma.masked_invalid(difference).mask.any()
         assert np.nanmax(np.abs(difference)) < 1e-9
@@ -67,7 +67,7 @@ def test_difference_maps_vanish_for_a_perfect_measurement_and_hide_the_unobserve
 
 def test_maps_without_truth_have_one_panel(case):
     measurement, _ = case
-    for figure in figures.stretch_maps(axis_history(measurement)):
+    for figure in figures.stretch_maps(centre_line(measurement)):
         assert len(figure.axes) == 2  # the map and its colour bar
 
 
@@ -140,15 +140,16 @@ def test_the_noise_floor_is_drawn_beside_the_true_scatter_where_there_is_one():
 
 def test_a_band_is_two_standard_deviations_around_the_error(case):
     measurement, truth = case
-    axis = axis_deviation(measurement, truth)
-    figure = figures.error_bands(axis)
+    centre = centre_line_deviation(measurement, truth)
+    figure = figures.error_bands(centre)
     assert len(figure.axes) == 12  # three heights, three directions and the strain
     levels = [
-        np.flatnonzero(np.isclose(axis.level_mm, float(ax.get_ylabel()[4:-3]), atol=0.006)) for ax in figure.axes[::4]
+        np.flatnonzero(np.isclose(centre.level_mm, float(ax.get_ylabel()[4:-3]), atol=0.006))
+        for ax in figure.axes[::4]
     ]
     for row, (level,) in enumerate(levels):
-        histories = [*zip(axis.error[:, level].T, axis.std[:, level].T, strict=True)]
-        histories.append((100 * axis.strain_error[:, level], 100 * axis.strain_std[:, level]))
+        histories = [*zip(centre.error[:, level].T, centre.std[:, level].T, strict=True)]
+        histories.append((100 * centre.strain_error[:, level], 100 * centre.strain_std[:, level]))
         for ax, (error, std) in zip(figure.axes[4 * row : 4 * row + 4], histories, strict=True):
             np.testing.assert_array_equal(ax.lines[1].get_ydata(), error)
             (band,) = ax.collections
@@ -156,7 +157,7 @@ def test_a_band_is_two_standard_deviations_around_the_error(case):
             for step in (3, 17):
                 at = np.unique(corners[corners[:, 0] == step, 1])
                 np.testing.assert_allclose(at[[0, -1]], [error[step] - 2 * std[step], error[step] + 2 * std[step]])
-    assert axis.level_mm[levels[0][0]] > axis.level_mm[levels[2][0]]
+    assert centre.level_mm[levels[0][0]] > centre.level_mm[levels[2][0]]
 
 
 def test_bands_of_steps_measured_alone_are_bars():
@@ -170,12 +171,12 @@ def test_bands_of_steps_measured_alone_are_bars():
 
 def test_maps_of_standard_deviations_hide_the_unobserved(case):
     measurement, _ = case
-    axis = axis_deviation(measurement)
-    figure = figures.std_maps(axis)
+    centre = centre_line_deviation(measurement)
+    figure = figures.std_maps(centre)
     maps = [np.ma.filled(ax.collections[0].get_array(), np.nan) for ax in figure.axes[:4]]
     for k in range(3):
-        np.testing.assert_array_equal(maps[k], axis.std[..., k].T)
-    np.testing.assert_array_equal(maps[3], 100 * axis.strain_std.T)
+        np.testing.assert_array_equal(maps[k], centre.std[..., k].T)
+    np.testing.assert_array_equal(maps[3], 100 * centre.strain_std.T)
     assert np.isnan(maps[0][8]).all()
     assert np.isfinite(maps[0][:8]).all()
     figure.draw_without_rendering()
@@ -183,17 +184,17 @@ def test_maps_of_standard_deviations_hide_the_unobserved(case):
 
 def test_without_truth_standard_deviations_are_drawn_against_the_step(case):
     measurement, _ = case
-    axis = axis_deviation(measurement)
-    figure = figures.std_histories(axis)
+    centre = centre_line_deviation(measurement)
+    figure = figures.std_histories(centre)
     assert [len(ax.lines) for ax in figure.axes] == [3, 3, 3, 3]
     drawn = {line.get_label(): line.get_ydata() for line in figure.axes[1].lines}
     for level in (1, 3, 5):
-        np.testing.assert_array_equal(drawn[f"z = {axis.level_mm[level]:.2f} mm"], axis.std[:, level, 1])
+        np.testing.assert_array_equal(drawn[f"z = {centre.level_mm[level]:.2f} mm"], centre.std[:, level, 1])
 
 
 def test_uncertainties_of_a_motion_that_nobody_saw_can_be_drawn():
     measurement = records.measurement(np.full((records.STEPS, 9, 6), np.nan))
-    axis = axis_deviation(measurement)
-    assert np.isnan(axis.std).all()
-    for figure in (figures.std_maps(axis), figures.std_histories(axis)):
+    centre = centre_line_deviation(measurement)
+    assert np.isnan(centre.std).all()
+    for figure in (figures.std_maps(centre), figures.std_histories(centre)):
         figure.draw_without_rendering()

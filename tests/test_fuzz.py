@@ -25,12 +25,12 @@ from benchmarks.faults import SCENARIO, STUDY
 from pdvc.experiment import Description, ExperimentError, read_experiment
 from pdvc.measurement import read_measurement
 from pdvc.options import MeasureOptions
+from pdvc.result_checks import check_finite
 from pdvc.settings import SettingsError
 from simulator.scanner import simulate
 from simulator.scenario import load_scenario
 from tests.command_line import pdvc_bench
-from validation.measuring import check_finite
-from validation.study import Study, trials_of
+from validation.study.description import Study, trials_of
 
 MORE = int(os.environ.get("FUZZ", "1"))
 STACKS = ("reference/radiographs.tif", "test/radiographs.tif", "flats.tif", "darks.tif")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pdvc.geometry import ConeBeam
 from pdvc.rays import directions, ray_vectors
 from tests.laws import law
-from validation.strategies import angles_rad, cone_beams
+from validation.testing.strategies import angles_rad, cone_beams
 
 SCANNER = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=60, columns=44)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from validation.intervals import Estimate, bootstrapped, mean, rms
+from validation.scoring.bootstrap import Estimate, bootstrapped, mean, rms
 
 
 def test_equal_repetitions_leave_no_doubt():

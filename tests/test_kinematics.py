@@ -21,7 +21,7 @@ from simulator.kinematics import BeamMotion, Composition, MotionError, RigidMoti
 from simulator.loading import Loading, load_history
 from simulator.specimen import Specimen, area_mm2
 from tests.laws import law
-from validation.strategies import beam_motions, motions, rigid_motions, section_motions
+from validation.testing.strategies import beam_motions, motions, rigid_motions, section_motions
 
 FEW = law(40)
 ANGLE = 2 * np.pi * np.arange(127) / 50

@@ -1,4 +1,4 @@
-"""Laws of the measurement, on whatever `validation.strategies` draws.
+"""Laws of the measurement, on whatever `validation.testing.strategies` draws.
 
 Through the whole pipeline, from counts to motion:
 
@@ -27,10 +27,10 @@ from simulator.scenario import course_of
 from simulator.truth import sample_truth
 from simulator.views import prepare, step_image, view_image
 from tests.laws import law
-from validation.bound import bound_of
-from validation.scores import point_errors
-from validation.small_cases import SmallExperiment
-from validation.strategies import small_experiments
+from validation.scoring.bound import bound_of
+from validation.scoring.scores import point_errors
+from validation.testing.small_cases import SmallExperiment
+from validation.testing.strategies import small_experiments
 
 THROUGH = law(3, cost=10)
 """A law through the whole pipeline costs some two seconds an example; the first is the plainest that there is."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pdvc.measure import measure
 from pdvc.options import StageOptions
-from validation.small_cases import SmallExperiment, small_scenario
+from validation.testing.small_cases import SmallExperiment, small_scenario
 
 
 def test_the_last_stage_ends_at_the_noise_but_not_the_rigid_one_that_it_starts_from():

@@ -12,8 +12,8 @@ import pytest
 from pdvc.history import Steps
 from pdvc.options import MeasureOptions, paper_options
 from tests.command_line import install
-from validation import methods
-from validation.methods import MethodError, find_method, method_names
+from validation.methods import registry as methods
+from validation.methods.registry import MethodError, find_method, method_names
 
 ROOT = Path(__file__).parent.parent
 OURS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][methods.GROUP]

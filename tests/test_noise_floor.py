@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from simulator.scenario import course_of
 from tests import synthetic_records as records
 from tests.laws import law
-from validation.noise_floor import constant_load_steps, noise_floor, without_rigid_motion
-from validation.small_cases import SmallExperiment, small_scenario
+from validation.scoring.noise_floor import constant_load_steps, noise_floor, without_rigid_motion
+from validation.testing.small_cases import SmallExperiment, small_scenario
 
 TURN = 10
 STEPS = records.STEPS

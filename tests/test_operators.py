@@ -30,7 +30,7 @@ from tests.small_case import (
     rays_at,
     textured,
 )
-from validation.strategies import cone_beams, section_bases
+from validation.testing.strategies import cone_beams, section_bases
 
 STEEP = ConeBeam(
     source_axis_mm=3.0,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests import synthetic_records as records
-from validation.machine_time import gains
-from validation.paired import QUANTITIES, FieldErrors, errors_of, summarised, where_all
-from validation.scores import score
+from validation.compare.machine_time import gains
+from validation.compare.paired import QUANTITIES, FieldErrors, errors_of, summarised, where_all
+from validation.scoring.scores import score
 
 STEPS, POINTS, INTERVALS = 8, 5, 3
 

@@ -18,11 +18,11 @@ from simulator.truth import read_truth
 from tests.command_line import pdvc_bench
 from tests.laws import law
 from tests.tiny_scenarios import TINY, trial
-from validation.calibration import calibration
-from validation.plan import _stretched, designs_around, plan
-from validation.plan_tables import designs_csv, designs_table, weak_table
-from validation.scores import point_errors
-from validation.small_cases import small_options, small_scenario
+from validation.plan.plan import _stretched, designs_around, plan
+from validation.plan.tables import designs_csv, designs_table, weak_table
+from validation.scoring.interval_calibration import interval_calibration
+from validation.scoring.scores import point_errors
+from validation.testing.small_cases import small_options, small_scenario
 
 ONE = trial({"sections": 4})
 
@@ -44,7 +44,7 @@ def test_what_is_planned_is_what_the_measurement_says_of_itself(planned, tmp_pat
     simulate(ONE.scenario, tmp_path / "experiment")
     truth = read_truth(tmp_path / "experiment")
     measured = measure(read_experiment(tmp_path / "experiment"), ONE.options)
-    predicted = calibration(measured, truth, point_errors(measured, truth).components).predicted
+    predicted = interval_calibration(measured, truth, point_errors(measured, truth).components).predicted
     for name in ("across_beam", "vertical"):
         assert getattr(planned.own.deviation, name) == pytest.approx(getattr(predicted, name), rel=0.35), name
 

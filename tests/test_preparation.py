@@ -13,8 +13,8 @@ from pdvc.progress import silent
 from pdvc.radiographs import calibrate
 from pdvc.store import Store
 from pdvc.window import used_window
-from validation.bound import noise_free
-from validation.small_cases import SmallExperiment, small_scenario
+from validation.scoring.bound import noise_free
+from validation.testing.small_cases import SmallExperiment, small_scenario
 
 SMALL = SmallExperiment(small_scenario({"detector.bad_pixel_fraction": 0.0}))
 

@@ -14,7 +14,7 @@ from pdvc.equations import Equations, linearise
 from pdvc.prior import Prior
 from pdvc.uncertainty import posterior
 from tests.laws import law
-from validation.strategies import projected_cases
+from validation.testing.strategies import projected_cases
 
 QUICK = law(6)
 

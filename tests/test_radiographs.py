@@ -25,7 +25,7 @@ from pdvc.radiographs import (
 )
 from pdvc.rays import ray_vectors
 from tests.laws import law
-from validation.strategies import cone_beams
+from validation.testing.strategies import cone_beams
 
 ROWS, COLUMNS = 31, 22
 BAD = [(0, 0), (5, 7), (5, 8), (20, 21), (30, 3)]

@@ -20,7 +20,7 @@ from simulator.microstructure import Graphite, place
 from simulator.radiography import Body, path_lengths
 from simulator.specimen import Specimen, dog_bone, section_mm, turn_back
 from tests.laws import law
-from validation.strategies import angles_rad, cone_beams
+from validation.testing.strategies import angles_rad, cone_beams
 
 SCANNER = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=60, columns=44)
 PARALLEL = ConeBeam(source_axis_mm=1e6, source_detector_mm=1.0001e6, pixel_mm=0.02, rows=170, columns=150)

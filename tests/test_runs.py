@@ -13,8 +13,8 @@ import pytest
 from distributed import LocalCluster
 
 from tests.made_up_runs import Sum
-from validation import runs
-from validation.runs import is_done, run_trials
+from validation.batch import engine as runs
+from validation.batch.engine import is_done, run_trials
 
 
 def diary(folder):

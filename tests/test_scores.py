@@ -14,8 +14,8 @@ from hypothesis.extra.numpy import arrays
 from pdvc.measurement import MeasurementError
 from tests import synthetic_records as records
 from tests.laws import law
-from validation.axis import axis_history, measured_at
-from validation.scores import Errors, point_errors, score
+from validation.scoring.centre_line import centre_line, measured_at
+from validation.scoring.scores import Errors, point_errors, score
 
 VOXEL = records.VOXEL_MM
 
@@ -136,16 +136,16 @@ def test_strain_error_of_a_known_strain_offset():
 
 def test_levels_are_a_section_apart_on_the_axis():
     truth, amplitude = records.stretched(np.zeros(3), np.zeros((3, 3)))
-    axis = axis_history(records.measurement(amplitude), truth)
-    assert np.diff(axis.level_mm) == pytest.approx(np.diff(records.HEIGHT_MM).mean(), rel=0.2)
+    centre = centre_line(records.measurement(amplitude), truth)
+    assert np.diff(centre.level_mm) == pytest.approx(np.diff(records.HEIGHT_MM).mean(), rel=0.2)
 
 
 def test_without_truth_the_sections_themselves_are_followed():
     _, measurement = tensile()
-    axis = axis_history(measurement)
-    assert axis.true is None
-    np.testing.assert_allclose(axis.measured[..., 2], measurement.amplitude[..., 2])
-    assert axis.stretch(axis.measured).mean(axis=1) == pytest.approx(0, abs=1e-9)
+    centre = centre_line(measurement)
+    assert centre.true is None
+    np.testing.assert_allclose(centre.measured[..., 2], measurement.amplitude[..., 2])
+    assert centre.stretch(centre.measured).mean(axis=1) == pytest.approx(0, abs=1e-9)
 
 
 def test_json_has_the_promised_keys_and_null_for_what_is_unknown():
@@ -192,6 +192,6 @@ def test_a_level_that_leaves_the_field_does_not_make_the_mean_translation_jump()
     offset = np.zeros((6, 3))
     offset[:, 2] = np.linspace(0, 1, 6)
     truth, amplitude = records.stretched(np.full(6, 0.05), offset)
-    axis = axis_history(records.measurement(amplitude), truth)
-    assert np.isnan(axis.measured[..., 2]).any(axis=1).sum() > 1
-    np.testing.assert_allclose(np.diff(axis.translation(axis.measured)[:, 2]), 0.2 / VOXEL)
+    centre = centre_line(records.measurement(amplitude), truth)
+    assert np.isnan(centre.measured[..., 2]).any(axis=1).sum() > 1
+    np.testing.assert_allclose(np.diff(centre.translation(centre.measured)[:, 2]), 0.2 / VOXEL)

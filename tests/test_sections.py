@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
 from tests.laws import law
-from validation.strategies import section_bases
+from validation.testing.strategies import section_bases
 
 NUMBERS = st.floats(-10.0, 10.0)
 POINTS = arrays(float, (7, 3), elements=NUMBERS)

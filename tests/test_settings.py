@@ -9,7 +9,7 @@ from pdvc.options import MeasureOptions, StageOptions
 from pdvc.settings import SettingsError, read_toml
 from simulator.scenario import Scenario
 from tests.laws import law
-from validation.strategies import descriptions
+from validation.testing.strategies import descriptions
 
 VALID = {
     "geometry": {"source_axis_mm": 30.0, "source_detector_mm": 300.0, "pixel_mm": 0.5, "rows": 6, "columns": 4},

@@ -19,10 +19,10 @@ from simulator.scanner import simulate
 from simulator.scenario import Scenario
 from simulator.truth import read_truth
 from tests.tiny_scenarios import TINY
-from validation import spam as room
-from validation.methods import MethodError, find_method
-from validation.scores import score
-from validation.spam import PROGRAMS, Nodes, correlated, fitted, placed, union, with_air
+from validation.methods import spam as room
+from validation.methods.registry import MethodError, find_method
+from validation.methods.spam import PROGRAMS, Nodes, correlated, fitted, placed, union, with_air
+from validation.scoring.scores import score
 
 VOXEL_MM = 0.05
 

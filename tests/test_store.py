@@ -22,7 +22,7 @@ from pdvc.measure import measure
 from pdvc.options import MeasureOptions
 from pdvc.settings import Settings
 from pdvc.store import Store, experiment_digest, reference_digest
-from validation.small_cases import SmallExperiment, small_scenario
+from validation.testing.small_cases import SmallExperiment, small_scenario
 
 GEOMETRY = ConeBeam(source_axis_mm=20, source_detector_mm=40, pixel_mm=0.1, rows=3, columns=4)
 WITHOUT_EFFECT = {"title", "material"}

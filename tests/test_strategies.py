@@ -17,9 +17,9 @@ from pdvc.sections import SectionBasis
 from pdvc.settings import SettingsError
 from simulator.scenario import Scenario, course_of
 from tests.laws import law
-from validation.scores import score
-from validation.small_cases import ProjectedCase, SmallExperiment, small_scenario
-from validation.strategies import amplitudes, projected_cases, scenarios, section_bases, small_experiments
+from validation.scoring.scores import score
+from validation.testing.small_cases import ProjectedCase, SmallExperiment, small_scenario
+from validation.testing.strategies import amplitudes, projected_cases, scenarios, section_bases, small_experiments
 
 FEW = settings(max_examples=3, deadline=None, derandomize=True)
 QUIET = settings(max_examples=100, deadline=None, derandomize=True, database=None)
@@ -126,6 +126,6 @@ def test_a_misspelt_key_of_a_small_scenario_is_named():
 
 
 def test_without_hypothesis_the_extra_to_install_is_named():
-    code = "import sys; sys.modules['hypothesis'] = None; import validation.strategies"
+    code = "import sys; sys.modules['hypothesis'] = None; import validation.testing.strategies"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "pip install 'pdvc-bench[strategies]'" in result.stderr.splitlines()[-1]

@@ -21,8 +21,8 @@ from simulator.scenario import load_scenario
 from simulator.views import stream
 from tests.command_line import only_line, pdvc_bench
 from tests.laws import law
-from validation.runs import is_done
-from validation.study import Study, builtin_studies, combinations, study_file, trials_of
+from validation.batch.engine import is_done
+from validation.study.description import Study, builtin_studies, combinations, study_file, trials_of
 
 SCENARIO = """
 name = "tiny"
@@ -276,15 +276,15 @@ class TestAWholeStudy:
         folder, _ = undisturbed
         before = {path: path.stat().st_mtime_ns for path in (folder / "out" / "runs").iterdir()}
         (folder / "out" / "study.html").unlink()
-        monkeypatch.setattr("validation.runs.connected", None)
-        monkeypatch.setattr("validation.study_report.study_pictures", lambda *_: [])
+        monkeypatch.setattr("validation.batch.engine.connected", None)
+        monkeypatch.setattr("validation.study.page.study_pictures", lambda *_: [])
         result = pdvc_bench("study", folder / "study.toml", "-o", folder / "out")
         assert result.exit_code == 0, result.stderr
         assert {path: path.stat().st_mtime_ns for path in (folder / "out" / "runs").iterdir()} == before
         assert (folder / "out" / "study.html").exists()
 
     def test_a_run_that_fails_is_a_row_and_the_rest_goes_on(self, address, tmp_path, monkeypatch):
-        monkeypatch.setattr("validation.study_report.study_pictures", lambda *_: [])
+        monkeypatch.setattr("validation.study.page.study_pictures", lambda *_: [])
         # a beam that makes less than a count is none
         factor = """
             [[factor]]
@@ -303,7 +303,7 @@ class TestAWholeStudy:
 
 
 def test_a_study_that_was_killed_goes_on_to_the_same_table(undisturbed, address, monkeypatch):
-    monkeypatch.setattr("validation.study_report.study_pictures", lambda *_: [])
+    monkeypatch.setattr("validation.study.page.study_pictures", lambda *_: [])
     folder, _ = undisturbed
     out = folder / "killed"
     command = [sys.executable, "-m", "validation.cli", "study", folder / "study.toml", "-o", out, "--workers", "1"]

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.laws import law
-from validation.study import Study
-from validation.study_figures import study_pictures
-from validation.study_report import write_study_report
-from validation.summary import PARTS, QUANTITIES, estimates, mean_scores, summarise
+from validation.study.description import Study
+from validation.study.figures import study_pictures
+from validation.study.page import write_study_report
+from validation.study.summary import PARTS, QUANTITIES, estimates, mean_scores, summarise
 
 
 def test_two_draws_by_hand():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.tiny_scenarios import trial
-from validation import trial as room
-from validation.trial import BOUND_COLUMNS, Volumes, clean_parts, score_columns
+from validation.batch import trial as room
+from validation.batch.trial import BOUND_COLUMNS, Volumes, clean_parts, score_columns
 
 
 def without_times(scores):

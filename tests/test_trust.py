@@ -9,10 +9,16 @@ import pytest
 
 from pdvc.measurement import ResidualTests
 from tests import synthetic_records as records
-from validation.calibration import Quantities
-from validation.report import write_report
-from validation.scores import score
-from validation.trust import calibration_sentences, nees_sentence, noise_known, residual_sentences, trust_table
+from validation.report.page import write_report
+from validation.report.sentences import (
+    calibration_sentences,
+    nees_sentence,
+    noise_known,
+    residual_sentences,
+    trust_table,
+)
+from validation.scoring.interval_calibration import Quantities
+from validation.scoring.scores import score
 
 AS_NOISE = ResidualTests(
     chi2_reduced=1.01, lag1_row=0.21, lag1_column=0.30, lag1_row_expected=0.2, lag1_column_expected=0.29

@@ -8,9 +8,9 @@ import pytest
 from pdvc.experiment import InterruptedScan
 from pdvc.measurement import read_measurement, write_measurement
 from pdvc.volume_correlation import correlate
-from validation.report import write_report
-from validation.scores import point_errors, score
-from validation.small_cases import SmallExperiment, small_options, small_scenario
+from validation.report.page import write_report
+from validation.scoring.scores import point_errors, score
+from validation.testing.small_cases import SmallExperiment, small_options, small_scenario
 
 HELD = (0, 12, 17)
 CASE = SmallExperiment(small_scenario({"interrupted.steps": HELD}))

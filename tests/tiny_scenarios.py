@@ -7,7 +7,7 @@ from typing import Any
 
 from pdvc.options import MeasureOptions, StageOptions
 from simulator.scenario import Scenario
-from validation.trial import Trial
+from validation.batch.trial import Trial
 
 TINY = """
 name = "tiny"

@@ -26,14 +26,14 @@ from rich.table import Table
 
 from pdvc.lock import FULL_DISK
 from pdvc.verdict import Doubt, Verdict
-from validation.scores import Scores
+from validation.scoring.scores import Scores
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from pdvc.measurement import Measurement
     from simulator.scenario import Scenario
-    from validation.study import Study
+    from validation.study.description import Study
 
 INTERRUPTED = 130
 WRONG_INPUT = 2

@@ -23,7 +23,7 @@ from benchmarks.bad_inputs.experiments import EXPERIMENTS
 from benchmarks.bad_inputs.record import BadInput, Folder
 from pdvc.measurement import Measurement, MeasurementError, read_measurement
 from simulator.scanner import simulate
-from validation.axis import axis_history
+from validation.scoring.centre_line import centre_line
 
 _PROGRESS = re.compile(r": \d+ of \d+ in [\d.]+ s$|^(measurement|report): ")
 _RAW = re.compile(r"^Traceback |:\d+: \w*Warning: ")
@@ -143,7 +143,7 @@ class Bench:
         # the server imports once what every command needs; it computes nothing, so that forking it is safe
         self._processes = multiprocessing.get_context("forkserver")
         self._processes.set_forkserver_preload(
-            ["pdvc.measure", "validation.cli", "validation.report", "simulator.scanner"]
+            ["pdvc.measure", "validation.cli", "validation.report.page", "simulator.scanner"]
         )
 
     def simulated(self, name: str) -> Path:
@@ -229,7 +229,7 @@ class Bench:
 def largest_strain(measurement: Measurement) -> float:
     """Return the largest |du_z / dz| between observed sections at any step, without unit; nan where there are none."""
     try:
-        history = axis_history(measurement)
+        history = centre_line(measurement)
     except MeasurementError:
         return math.nan
     strain = np.abs(history.strain(history.measured))

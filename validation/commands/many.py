@@ -1,0 +1,173 @@
+"""The commands about many experiments at once: compare, studies, study, plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from validation.commands.parts import (
+    Options,
+    ScenarioName,
+    Scheduler,
+    Threads,
+    Workers,
+    answering,
+    read_options,
+    tell,
+    use_threads,
+)
+
+
+def compare(
+    scenarios: Annotated[
+        list[str],
+        typer.Argument(metavar="SCENARIO...", help="Built-in names (see: scenarios), or paths of TOML files."),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            "--methods",
+            metavar="NAME,...",
+            help="Which methods, separated by commas; unless given: all that are installed, but for spam.",
+        ),
+    ] = None,
+    repetitions: Annotated[
+        int,
+        typer.Option("--repetitions", min=1, metavar="N", help="Noise draws of each scenario; three give intervals."),
+    ] = 3,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Let several methods measure the same experiments, and set their errors against what they cost.
+
+    Writes DIR/comparison.html, figures/, and tables as CSV, Parquet, Markdown and LaTeX. Methods that need full scans
+    get a few at interruptions of the test. Interrupted, it goes on where it was when the same command is given again.
+
+    Example:  `pdvc-bench compare quick --methods pgd,weighted,each-step -o out/compare`
+    """
+    with answering(resume="give the same command again to go on from here") as progress:
+        from simulator.scenario import load_scenario
+        from validation.compare.comparison import Comparison
+        from validation.compare.comparison import compare as do
+        from validation.methods.registry import default_methods, find_method
+
+        names = default_methods() if methods is None else [name.strip() for name in methods.split(",")]
+        comparison = Comparison(
+            scenarios=tuple(load_scenario(name) for name in scenarios),
+            methods=tuple(find_method(name) for name in names),
+            repetitions=repetitions,
+        )
+        comparison.check()
+        for name, note in comparison.notes().items():
+            tell(f"{name}: {note[0].lower()}{note[1:]}")
+        page = do(comparison, out, scheduler=scheduler, workers=workers, progress=progress)
+    print((out / "methods.md").read_text(encoding="utf-8"), end="")
+    tell(f"comparison: {page}")
+
+
+def studies(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[STUDY]", help="Print this one as TOML, to start your own from.")
+    ] = None,
+) -> None:
+    """List the built-in studies, or print one as TOML.
+
+    Example:  `pdvc-bench studies noise > mine.toml`
+    """
+    with answering():
+        from validation.study.description import Study, builtin_studies, study_file
+
+        if name is not None:
+            Study.read(study_file(name))
+            print(study_file(name).read_text(encoding="utf-8"), end="")
+            return
+        from rich.console import Console
+
+        from validation.console import study_table
+
+        Console().print(study_table(Study.read(study_file(each)) for each in builtin_studies()))
+
+
+def study(
+    study: Annotated[
+        str, typer.Argument(metavar="STUDY", help="A built-in name (see: studies), or the path of a TOML file.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Simulate and measure many experiments that differ in chosen factors, and show how the error depends on these.
+
+    Writes a row for each run as soon as it is finished, and at the end DIR/table.parquet, summary.csv, figures/ and
+    study.html. Interrupted or killed, it goes on where it was when the same command is given again.
+
+    Example:  `pdvc-bench study noise -o out/noise`
+    """
+    with answering(resume="give the same command again to go on from here") as progress:
+        from pdvc.lock import held
+        from validation.batch.doubts import doubted
+        from validation.batch.engine import run_trials
+        from validation.batch.machine import machine
+        from validation.study.description import Study, study_file, trials_of
+        from validation.study.page import write_study_report
+
+        path = study_file(study)
+        chosen = Study.read(path)
+        trials = trials_of(chosen, path)
+        if scheduler is not None and workers is not None:
+            raise ValueError("--workers: expected without --scheduler, which has its own workers")
+        with held(out):
+            table = run_trials(trials, out, scheduler=scheduler, workers=workers, progress=progress)
+            page, summary = write_study_report(
+                out, chosen, path.read_text(encoding="utf-8"), table, where=machine(scheduler, workers)
+            )
+    from rich.console import Console
+
+    from validation.console import study_summary
+
+    Console().print(study_summary(chosen, summary))
+    failed = int((table["status"] != "done").sum())
+    if failed:
+        tell(f"{failed} of {len(table)} runs failed: see the reasons in {page}, or {out / 'failed'}")
+    number, reasons = doubted(table)
+    if number:
+        tell(f"{number} of {len(table)} measurements are doubted: {reasons}")
+    tell(f"report: {page}")
+
+
+def plan(
+    scenario: ScenarioName,
+    options: Options = "default",
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="CSV", help="Write the designs here, too, as a table.")
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Tell what to expect of a test before it is made, and which motions it would not show.
+
+    From the reference scan's sensitivities alone: the standard deviations of the scenario as it is, and with other
+    numbers of radiographs a turn, turns, frames, flats and sections. They hold noise and prior, not model errors.
+
+    Example:  `pdvc-bench plan quick`
+    """
+    with answering() as progress:
+        from simulator.scenario import load_scenario
+        from validation.job import write_text
+        from validation.plan.plan import plan as work_out
+        from validation.plan.tables import designs_csv, designs_table, weak_table
+
+        chosen, read = load_scenario(scenario), read_options(options)
+        use_threads(threads)
+        found = work_out(chosen, read, progress=progress)
+        if out is not None:
+            write_text(out, designs_csv(found))
+    from rich.console import Console
+
+    console = Console()
+    console.print(designs_table(found, chosen))
+    console.print(weak_table(found))
+    if out is not None:
+        tell(f"table: {out}")

@@ -1,0 +1,1 @@
+"""Comparisons: several methods measure the same experiments."""

@@ -1,0 +1,1 @@
+"""Plans: what to expect of a test before it is made."""

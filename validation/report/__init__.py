@@ -1,0 +1,1 @@
+"""What is shown of one measurement: figures, sentences, and a self-contained page."""

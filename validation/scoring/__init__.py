@@ -1,0 +1,1 @@
+"""Scores of a measurement against its truth, and whether its stated intervals hold."""

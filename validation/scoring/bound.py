@@ -1,0 +1,167 @@
+"""The Cramer-Rao bound: the least random error that an unbiased measurement of a scenario's radiographs can have.
+
+The noise of each pixel is known and independent, its variance v(t, p) that of photons and readout. With S the
+sensitivities at the true motion and P the prior's precision, the information in the radiographs of the test is
+
+    I = sum_t sigma(t) sigma(t)^T (x) S(t)^T diag(1 / v(t)) S(t) + P,          C >= I^-1
+
+The sample at rest is taken as known: the noise of the reference scan and of the flats is not in the bound, and is one
+of the reasons why a measurement stays above it. S is pdvc's own, from the scenario without any noise, so that what
+reconstruction blurs is missing in it; the radiographs are not filtered.
+
+Efficiency is the bound over the random error that was observed, both as standard deviations.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import uuid
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.equations import Images, linearise
+from pdvc.experiment import Experiment, read_experiment
+from pdvc.gauss_newton import hessian
+from pdvc.history import time_basis
+from pdvc.measurement import step_covariance, strain_std, turned_std
+from pdvc.noise import separate
+from pdvc.options import MeasureOptions, resolved
+from pdvc.preparation import bases, calibrated, noise_of, prepare
+from pdvc.prior import solved
+from pdvc.progress import Progress, silent
+from pdvc.sections import SectionBasis
+from pdvc.store import Store
+from pdvc.window import used_window
+from simulator.scanner import simulate
+from simulator.scenario import Scenario
+from simulator.truth import read_truth
+from validation.scoring.centre_line import TruePoints, current_positions, points_on_axis
+from validation.scoring.interval_calibration import Quantities, true_coefficients
+
+Floats = NDArray[np.float64]
+
+_PHOTONS = 1e13
+"""Photons in a pixel of what counts as free of noise: the rounding of counts is a hundred times as much."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bound:
+    """Hold the bound on the covariance of a motion."""
+
+    basis: SectionBasis
+    time_functions: Floats
+    angle_rad: Floats
+    """(step,)"""
+    voxel_mm: float
+    covariance: Floats
+    """As of Measurement."""
+
+    def quantities(self, truth: TruePoints) -> Quantities:
+        """Return rms standard deviations over steps and material points between the sections.
+
+        The strain is that of the scores: between material levels of the axis, about a section apart.
+        """
+        positions = current_positions(truth)
+        low, high = self.basis.height_mm[[0, -1]]
+        axis = points_on_axis(truth.point_mm, float(np.mean(np.diff(self.basis.height_mm))))
+        turned, strain = [], []
+        for step, x in enumerate(positions):
+            covariance = step_covariance(self.covariance, self.time_functions, step)
+            inside = (x[:, 2] >= low) & (x[:, 2] <= high)
+            turned.append(turned_std(self.basis, covariance, float(self.angle_rad[step]), x[inside]))
+            levels = axis[inside[axis]]
+            now, before = x[levels, 2], truth.point_mm[levels, 2]
+            stretched = np.diff(now) / np.diff(before)
+            strain.append(strain_std(self.basis, covariance, now, self.voxel_mm) * stretched)
+        across, vertical, along = np.sqrt((np.concatenate(turned) ** 2).mean(axis=0)).tolist()
+        of_strain = float(np.sqrt((np.concatenate(strain) ** 2).mean()))
+        return Quantities(across_beam=across, vertical=vertical, along_beam=along, strain=of_strain)
+
+
+def noise_free(scenario: Scenario) -> Scenario:
+    """Return the scenario with so many photons that only the rounding of counts is left, and no bad pixel."""
+    quiet = {"photons_per_pixel": _PHOTONS, "readout_noise_counts": 0.0, "bad_pixel_fraction": 0.0}
+    return scenario.model_copy(update={"detector": scenario.detector.model_copy(update=quiet), "repetition": 0})
+
+
+def bound_of(
+    scenario: Scenario, options: MeasureOptions, clean: Path | None = None, *, progress: Progress = silent
+) -> tuple[Bound, TruePoints]:
+    """Return the bound of a scenario for the bases and the prior of some options, and the true motion.
+
+    `clean` is a folder of noise-free radiographs (`simulator.clean`), shared with other work on the scenario.
+    """
+    options = options.model_copy(update={"smooth_px": 0.0})
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        simulate(noise_free(scenario), folder, clean=clean, progress=progress)
+        experiment, truth = read_experiment(folder), read_truth(folder)
+        detector = scenario.detector
+        known = replace(
+            experiment,
+            photons_per_count=detector.photons_per_count,
+            readout_noise_counts=detector.readout_noise_counts,
+            frames=detector.frames,
+        )
+        return _bound(known, truth, options, progress), truth
+
+
+def _bound(experiment: Experiment, truth: TruePoints, options: MeasureOptions, progress: Progress) -> Bound:
+    """Return the bound from an experiment whose counts are free of the noise that its description tells of."""
+    options = resolved(options, experiment.geometry)
+    store = Store(None, experiment)
+    calibration, outline = calibrated(experiment, options, store, progress)
+    window = used_window(experiment.geometry, options, outline.hull)
+    time_functions = time_basis(options.time, experiment.test)
+    _, basis = bases(experiment.geometry, window, outline.hull, options)
+    prepared = prepare(experiment, calibration, outline, window, 1, options, store, progress)
+    noise = noise_of(experiment, calibration, prepared, 0.0)
+    assert noise is not None, "a scenario tells its noise"
+    information = np.stack([1 / noise.step(t).variance for t in range(len(experiment.test))])
+    images = replace(prepared.images, weight=np.where(prepared.images.weight > 0, information, 0).astype(np.float32))
+    voxel_mm = experiment.geometry.voxel_mm
+    coefficients, _ = true_coefficients(basis, time_functions, voxel_mm, truth)
+    amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
+    return Bound(
+        basis=basis,
+        time_functions=time_functions,
+        angle_rad=experiment.test.angle_rad,
+        voxel_mm=voxel_mm,
+        covariance=_inverse(images, basis, amplitude, time_functions, options.prior_voxel, progress),
+    )
+
+
+def _inverse(
+    images: Images,
+    basis: SectionBasis,
+    amplitude: Floats,
+    time_functions: Floats,
+    prior_voxel: float,
+    progress: Progress,
+) -> Floats:
+    equations = linearise(images, basis, amplitude, progress=progress, task="bound")
+    size = basis.shape[0] * basis.shape[1]
+    if separate(time_functions):
+        first = [int(np.argmax(f != 0)) for f in time_functions]
+        matrices = [f[t] ** 2 * equations.matrix[t] for t, f in zip(first, time_functions, strict=True)]
+        return np.stack([solved(m + np.eye(size) / prior_voxel**2, np.eye(size)) for m in matrices])
+    matrix = hessian(equations.matrix, time_functions)
+    return solved(matrix + np.eye(len(matrix)) / prior_voxel**2, np.eye(len(matrix)))
+
+
+def kept_bound(scenario: Scenario, options: MeasureOptions, path: Path, clean: Path) -> Quantities:
+    """Return the bound's quantities, computed and kept as JSON in a file unless they are there."""
+    try:
+        return Quantities(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):  # not there, or damaged
+        found, truth = bound_of(scenario, options, clean)
+        quantities = found.quantities(truth)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+        partial.write_text(json.dumps(asdict(quantities)), encoding="utf-8")
+        partial.replace(path)
+        return quantities

@@ -1,0 +1,1 @@
+"""Studies: how errors depend on chosen factors, over many simulated experiments."""

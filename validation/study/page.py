@@ -1,0 +1,141 @@
+"""What a study leaves for a reader: summary, scores and coverage as CSV, figures, and one page, study.html."""
+
+from __future__ import annotations
+
+import base64
+from importlib.metadata import version
+from pathlib import Path
+
+import jinja2
+import numpy as np
+import pandas as pd
+
+from validation.batch.doubts import doubted
+from validation.batch.engine import FAILED
+from validation.study.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
+from validation.study.description import Study
+from validation.study.figures import study_pictures
+from validation.study.summary import PARTS, QUANTITIES, mean_scores, summarise
+
+HEADINGS = {
+    "voxel_across_beam": "across the beam, voxel",
+    "voxel_vertical": "vertical, voxel",
+    "voxel_along_beam": "along the beam, voxel",
+    "strain": "strain",
+}
+
+
+def write_study_report(
+    folder: Path, study: Study, text: str, table: pd.DataFrame, *, where: str
+) -> tuple[Path, pd.DataFrame]:
+    """Write tables, figures and page of a finished study; returns the page's path and the summary.
+
+    `text` is the study file, `where` says on what it ran.
+    """
+    summary = summarise(study, table, folder)
+    scores = mean_scores(study, table)
+    shown = honesty(study, table)
+    for name, frame in (("summary", summary), ("scores", scores), ("coverage", coverage_table(shown))):
+        partial = folder / f"{name}.csv.partial"
+        frame.to_csv(partial, index=False)
+        partial.replace(folder / f"{name}.csv")
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    pictures = []
+    for picture in study_pictures(study, summary):
+        path = folder / "figures" / f"{picture.name}.png"
+        picture.figure.savefig(path, dpi=120)
+        data = base64.b64encode(path.read_bytes()).decode("ascii")
+        pictures.append({"name": picture.name, "caption": picture.caption, "data": data})
+    page = folder / "study.html"
+    partial = page.with_name("study.html.partial")
+    partial.write_text(_page(study, text, table, summary, scores, shown, pictures, where), encoding="utf-8")
+    partial.replace(page)
+    return page, summary
+
+
+def _page(
+    study: Study,
+    text: str,
+    table: pd.DataFrame,
+    summary: pd.DataFrame,
+    scores: pd.DataFrame,
+    shown: list[Honesty],
+    pictures: list[dict[str, str]],
+    where: str,
+) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("validation.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    failed = table[table["status"] != "done"]
+    factors = [factor.column for factor in study.factor]
+    columns = [*factors, "repetition", "reason", "key"]
+    number, reasons = doubted(table)
+    return environment.get_template("study.html").render(
+        study=study,
+        text=text,
+        runs=len(table),
+        failed=[[_cell(row[name]) for name in columns] for _, row in failed.iterrows()],
+        failed_columns=columns,
+        doubted=number,
+        doubts=reasons,
+        failed_folder=FAILED,
+        factors=[factor.axis_label for factor in study.factor],
+        parts=PARTS,
+        quantities=[HEADINGS[quantity] for quantity in QUANTITIES],
+        bounded=any(f"bound_{quantity}" in summary for quantity in QUANTITIES),
+        rows=[_summary_row(row, factors) for _, row in summary.iterrows()],
+        coverage=[
+            {
+                "which": [_cell(value) for value in each.combination.values()],
+                "verdict": verdict(each),
+                "rows": _covered(each),
+            }
+            for each in shown
+        ],
+        scores_columns=list(scores.columns),
+        scores=[[_cell(value) for value in row] for row in scores.itertuples(index=False)],
+        pictures=pictures,
+        where=where,
+        hours=table["seconds"].sum() / 3600,
+        version=version("pdvc-bench"),
+    )
+
+
+def _covered(found: Honesty) -> list[list[str]]:
+    """Return a line for each direction: stated deviation, z, and the coverages with their binomial intervals."""
+    lines = []
+    for direction in DIRECTIONS:
+        shares = [
+            f"{100 * one.found.value:.1f} ({100 * one.binomial[0]:.0f} to {100 * one.binomial[1]:.0f})"
+            for one in found.covered
+            if one.direction == direction
+        ]
+        name = HEADINGS["strain" if direction == "strain" else f"voxel_{direction}"]
+        lines.append([name, _cell(found.predicted[direction]), _cell(found.z_rms[direction]), *shares])
+    return lines
+
+
+def _summary_row(row: pd.Series, factors: list[str]) -> dict[str, list[str]]:
+    """Return the cells of one combination: its factors and counts, then for each quantity the three parts."""
+    cells = []
+    for quantity in QUANTITIES:
+        cells += [_with_interval(row, f"{part}_{quantity}") for part in PARTS]
+        if f"bound_{quantity}" in row:
+            cells.append(_cell(row[f"bound_{quantity}"]))
+    which = [row[name] for name in (*factors, "runs", "failed")]
+    return {"which": [f"{each:g}" if isinstance(each, float) else str(each) for each in which], "cells": cells}
+
+
+def _with_interval(row: pd.Series, name: str) -> str:
+    value, low, high = (row[name + end] for end in ("", "_low", "_high"))
+    return _cell(value) + (f" ({_cell(low)} to {_cell(high)})" if np.isfinite(low) else "")
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, (float, np.floating)):
+        return f"{value:.3g}" if np.isfinite(value) else "—"
+    return str(value)

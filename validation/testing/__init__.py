@@ -1,0 +1,1 @@
+"""What tests of P-DVC start from: small cases, and hypothesis strategies."""
