@@ -13,7 +13,7 @@ from pdvc.experiment import read_experiment
 from pdvc.history import PAPER
 from pdvc.measure import MeasureOptions, measure
 from pdvc.options import paper_options
-from pdvc.sections import RIGID
+from pdvc.sections import RIGID, names_of
 from simulator.scanner import simulate
 from simulator.scenario import load_scenario
 from simulator.truth import read_truth
@@ -22,8 +22,8 @@ from validation.scoring.scores import score
 DEFAULT = MeasureOptions()
 CHOICES = {
     "default": DEFAULT,
-    "no contraction": DEFAULT.model_copy(update={"section_motions": RIGID}),
-    "no contraction, Table 1": DEFAULT.model_copy(update={"section_motions": RIGID, "time": PAPER}),
+    "no contraction": DEFAULT.model_copy(update={"section_motions": names_of(RIGID)}),
+    "no contraction, Table 1": DEFAULT.model_copy(update={"section_motions": names_of(RIGID), "time": PAPER}),
     "systematic residual left": DEFAULT.model_copy(update={"subtract_systematic": False}),
     "weighted by noise": DEFAULT.model_copy(update={"weighting": "noise"}),
     "beam hardening left": DEFAULT.model_copy(update={"beam_hardening": "none"}),

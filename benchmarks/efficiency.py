@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.rows import Row, keep, show
+from pdvc.gauss_newton import GaussNewton
 from pdvc.history import PAPER
 from pdvc.measure import measure
 from pdvc.options import MeasureOptions, StageOptions
-from pdvc.sections import RIGID
+from pdvc.sections import RIGID, names_of
 from simulator.scenario import load_scenario
 from validation.batch.trial import simulated
 from validation.scoring.bound import bound_of
@@ -27,9 +28,9 @@ from validation.scoring.scores import point_errors
 from validation.study.summary import estimates
 
 DRAWS = 10
-DIRECT = StageOptions(solver="gauss-newton", most=12, least_change_voxel=2e-4)
+DIRECT = StageOptions(solver=GaussNewton(most_passes=12, least_change_voxel=2e-4))
 OPTIONS = MeasureOptions(
-    section_motions=RIGID,
+    section_motions=names_of(RIGID),
     time=PAPER,
     weighting="noise",
     rigid=(DIRECT.model_copy(update={"scale": "coarse"}), DIRECT.model_copy(update={"scale": 2})),
@@ -53,7 +54,7 @@ def main() -> None:
                 with simulated(scenario.model_copy(update={"repetition": repetition}), shared) as (experiment, _, _):
                     found = measure(experiment, OPTIONS)
                     errors.append(point_errors(found, truth).components)
-                    sources.append(found.std_by_source)
+                    sources.append(found.motion.std_by_source)
                     stated.append(asdict(interval_calibration(found, truth, errors[-1]).predicted))
             least = asdict(bound.quantities(truth))
             for k, direction in enumerate(("across_beam", "vertical", "along_beam")):

@@ -57,7 +57,7 @@ def main() -> None:
             simulate(variant(photons, views, finer), Path(folder))
             measurement = measure(read_experiment(Path(folder)), MeasureOptions())
             scores = score(measurement, read_truth(Path(folder)))
-        micrometres = measurement.voxel_mm * 1e3
+        micrometres = measurement.recording.voxel_mm * 1e3
         row: Row = {
             "photons": f"{photons:.0f}",
             "views": views,

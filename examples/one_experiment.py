@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pdvc.experiment import read_experiment
 from pdvc.measure import measure
-from pdvc.measurement import write_measurement
+from pdvc.measurement_file import write_measurement
 from simulator.scanner import simulate
 from simulator.truth import read_truth
 from validation.scoring.scores import score
@@ -26,15 +26,15 @@ simulate(scenario, folder / "experiment")
 
 # from here on as with radiographs of a laboratory: the measurement does not look at the truth
 experiment = read_experiment(folder / "experiment")
-motion = measure(experiment, small_options(scenario))
-write_measurement(motion, folder / "motion.nc")
+measured = measure(experiment, small_options(scenario))
+write_measurement(measured, folder / "motion.nc")
 
 # displacement, in voxels, of what is 1 mm above mid-height on the axis at the last step
 last = len(experiment.test) - 1
-x, y, z = motion.displacement(last, [[0.0, 0.0, 1.0]])[0]
-print(f"last step, z = 1 mm: {x:.2f}, {y:.2f}, {z:.2f} voxels of {motion.voxel_mm * 1e3:.0f} um")
+x, y, z = measured.motion.displacement(last, [[0.0, 0.0, 1.0]])[0]
+print(f"last step, z = 1 mm: {x:.2f}, {y:.2f}, {z:.2f} voxels of {measured.recording.voxel_mm * 1e3:.0f} um")
 
-scores = score(motion, read_truth(folder / "experiment"))
+scores = score(measured, read_truth(folder / "experiment"))
 print(
     f"error across the beam {scores.error_voxel.across_beam:.3f}, vertical {scores.error_voxel.vertical:.3f} voxel rms"
 )

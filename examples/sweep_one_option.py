@@ -20,12 +20,12 @@ small = SmallExperiment(small_scenario({"seed": 1}))
 deviation = {}
 print("sections  unknowns  error across  vertical  strain error  std of u_z, expected")
 for sections in (3, 5, 8):
-    motion = measure(small.experiment, small.options.model_copy(update={"sections": sections}))
-    scores = score(motion, small.truth)
-    vertical = motion.amplitude_std[..., motion.basis.motions.index("translation_z")]
+    measured = measure(small.experiment, small.options.model_copy(update={"sections": sections}))
+    scores = score(measured, small.truth)
+    vertical = measured.motion.amplitude_std[..., measured.motion.basis.names.index("translation_z")]
     deviation[sections] = np.sqrt(np.mean(vertical**2))
     print(
-        f"{sections:8d}  {motion.unknowns:8d}  {scores.error_voxel.across_beam:12.3f}  "
+        f"{sections:8d}  {measured.fit.unknowns:8d}  {scores.error_voxel.across_beam:12.3f}  "
         f"{scores.error_voxel.vertical:8.3f}  {scores.strain_rms:12.4f}  {deviation[sections]:20.3f}"
     )
 assert deviation[3] < deviation[8]
@@ -39,6 +39,6 @@ fewer = replace(
     time_s=views.time_s[::2],
     force_N=views.force_N[::2],
 )
-motion = measure(replace(small.experiment, reference=fewer), small.options)
+measured = measure(replace(small.experiment, reference=fewer), small.options)
 print(f"with {len(fewer)} reference views instead of {len(views)}:")
-print(f"error across the beam {score(motion, small.truth).error_voxel.across_beam:.3f} voxel rms")
+print(f"error across the beam {score(measured, small.truth).error_voxel.across_beam:.3f} voxel rms")

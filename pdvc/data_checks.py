@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pdvc.examination import Examination, StackLook, examine, full_scale, with_angles
 from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, Experiment, ExperimentError, Series
-from pdvc.history import Ramp, TimeFunctions
+from pdvc.history import Ramp, TimeFunction
 from pdvc.onset import LEAST_PLATEAU, force_noise, onset
 from pdvc.progress import Progress, silent
 from pdvc.verdict import Doubt, listed
@@ -125,7 +125,7 @@ def doubts_of_data(found: Examination, experiment: Experiment) -> tuple[Doubt, .
     )
 
 
-def doubts_of_time(parts: tuple[TimeFunctions, ...], series: Series) -> Iterator[Doubt]:
+def doubts_of_time(parts: tuple[TimeFunction, ...], series: Series) -> Iterator[Doubt]:
     """Give what is wrong with time functions for the steps of a test."""
     starts = [part.start for part in parts if isinstance(part, Ramp) and isinstance(part.start, int)]
     last, found = len(series) - 1, onset(series.force_N)

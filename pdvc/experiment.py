@@ -199,9 +199,10 @@ class Experiment:
     """Full scans at some steps, in the order of the steps; only volume correlation looks at them."""
 
 
-def read_experiment(folder: Path) -> Experiment:
+def read_experiment(folder: Path, *, planned: bool = False) -> Experiment:
     """Open an experiment folder; the stacks stay on disk where their TIFF is uncompressed.
 
+    `planned`: the test is still to be made, of which only angles, times and forces are known, and has no counts.
     Raises ExperimentError or SettingsError, in one line, for whatever is missing, truncated or inconsistent.
     """
     if not folder.is_dir():
@@ -217,7 +218,7 @@ def read_experiment(folder: Path) -> Experiment:
         photons_per_count=acquisition.photons_per_count,
         readout_noise_counts=acquisition.readout_noise_counts,
         reference=_series(folder, REFERENCE, description.reference, "reference", geometry),
-        test=_series(folder, TEST, description.test, "test", geometry),
+        test=_planned(description.test) if planned else _series(folder, TEST, description.test, "test", geometry),
         flats=read_stack(folder / FLATS, size),
         darks=read_stack(folder / DARKS, size),
         interrupted=tuple(
@@ -242,6 +243,14 @@ def _series(folder: Path, name: str, entry: StackEntry, key: str, geometry: Cone
             f"{folder / name}: expected {len(entry.angle_deg)} radiographs, "
             f"one for each {key}.angle_deg in {DESCRIPTION}, found {len(counts)}"
         )
+    return _recorded(counts, entry)
+
+
+def _planned(entry: StackEntry) -> Series:
+    return _recorded(np.zeros((len(entry.angle_deg), 0, 0), dtype=np.uint16), entry)
+
+
+def _recorded(counts: NDArray[np.uint16], entry: StackEntry) -> Series:
     return Series(
         counts=counts,
         angle_rad=np.deg2rad(entry.angle_deg),

@@ -15,15 +15,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior, solved
-from pdvc.solution import SHORTER, Solution, evaluated, lowers
+from pdvc.solution import SHORTER, Problem, Solution, Solver, evaluated, lowers
 from pdvc.verdict import Stop
 
 Floats = NDArray[np.float64]
@@ -32,7 +34,7 @@ Indices = NDArray[np.intp]
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """Hold time functions that share steps with each other and with no others."""
+    """Time functions that share steps with each other and with no others."""
 
     functions: Indices
     steps: Indices
@@ -57,6 +59,33 @@ def hessian(matrices: Floats, time_functions: Floats) -> Floats:
     pairs = np.einsum("ft,gt->fgt", time_functions, time_functions).reshape(-1, steps)
     blocks = (pairs @ matrices.reshape(steps, -1)).reshape(functions, functions, size, size)
     return np.ascontiguousarray(blocks.transpose(0, 2, 1, 3)).reshape(functions * size, functions * size)
+
+
+class GaussNewton(Solver):
+    """All unknowns at once, by Gauss-Newton steps."""
+
+    kind: Literal["gauss-newton"] = "gauss-newton"
+    """all unknowns at once"""
+    most_passes: Annotated[int, Field(ge=1)] = 4
+    """largest number of steps, each a pass over all radiographs"""
+    least_change_voxel: Annotated[float, Field(gt=0)] = 2e-3
+    """converged: the displacement changes by less than this, voxel rms"""
+
+    def solve(self, problem: Problem) -> Solution:
+        """Repeat the direct solve until it converges, or as often as allowed; the noise is not asked for."""
+        return solve(
+            problem.linearise,
+            problem.time_functions,
+            problem.start,
+            problem.prior,
+            most_passes=self.most_passes,
+            least_change_voxel=self.least_change_voxel,
+        )
+
+    @property
+    def passes(self) -> float:
+        """Return about how many passes over all radiographs it may take."""
+        return self.most_passes * 0.6 + 1
 
 
 def solve(

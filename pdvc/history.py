@@ -4,11 +4,14 @@ Functions are made orthonormal over the steps, (1/N) sum_t s_i(t) s_j(t) = delta
 voxels is an rms displacement in voxels, and the equations are well conditioned. Functions that the others
 already span are dropped: over the paper's first turn, at constant force, T(t) and 1 are parallel, and only
 the whole test tells them apart.
+
+A further time function is a subclass of `TimeFunction` with a `kind` of its own: TOML finds it as soon as it is
+defined.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +20,7 @@ from scipy.interpolate import BSpline
 
 from pdvc.experiment import Series
 from pdvc.onset import onset
-from pdvc.settings import Settings
+from pdvc.settings import Choice
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +28,23 @@ INDEPENDENT = 1e-6
 """Functions whose part outside the others' span is below this share of their norm are dropped."""
 
 
-class Force(Settings):
+class TimeFunction(Choice):
+    """A kind of time function: one or more functions of the step, from what was recorded with each radiograph."""
+
+    def functions(self, series: Series) -> Floats:
+        """Return (function, step), neither orthogonal nor of any norm."""
+        raise NotImplementedError
+
+    def stretched(self, share: float) -> Self:
+        """Return what follows the same course over `share` times as many steps; the same, unless it counts steps."""
+        return self
+
+    def settled(self, series: Series) -> Self:
+        """Return the same with what it leaves to the data filled in, where the data tell it."""
+        return self
+
+
+class Force(TimeFunction):
     """T(t): the measured axial force."""
 
     kind: Literal["force"] = "force"
@@ -36,7 +55,7 @@ class Force(Settings):
         return series.force_N[None]
 
 
-class Angle(Settings):
+class Angle(TimeFunction):
     """sin(k theta(t)) and cos(k theta(t)): what a sample off the axis, or tilted, does."""
 
     kind: Literal["angle"] = "angle"
@@ -51,7 +70,7 @@ class Angle(Settings):
         return np.round(np.concatenate([np.sin(k), np.cos(k)]), 12)
 
 
-class Polynomial(Settings):
+class Polynomial(TimeFunction):
     """1, t, t^2 ..., with t the step."""
 
     kind: Literal["polynomial"] = "polynomial"
@@ -64,7 +83,7 @@ class Polynomial(Settings):
         return np.asarray(np.polynomial.legendre.legvander(_unit(len(series)), self.degree).T, dtype=float)
 
 
-class Ramp(Settings):
+class Ramp(TimeFunction):
     """max(t - start, 0)^p: what begins during the test."""
 
     kind: Literal["ramp"] = "ramp"
@@ -82,8 +101,17 @@ class Ramp(Settings):
         since = (np.arange(len(series)) - start) / len(series)
         return np.stack([np.where(since > 0, since**power, 0.0) for power in self.powers])
 
+    def stretched(self, share: float) -> Self:
+        """Return the ramp with its start moved along; an onset is found in the force, wherever it is."""
+        return self if self.start == "onset" else self.model_copy(update={"start": round(self.start * share)})
 
-class Splines(Settings):
+    def settled(self, series: Series) -> Self:
+        """Return the ramp with the onset of loading as a step, where the force shows one."""
+        found = onset(series.force_N) if self.start == "onset" else None
+        return self if found is None else self.model_copy(update={"start": found})
+
+
+class Splines(TimeFunction):
     """B-splines on equal intervals of steps; degree 1 makes tents, piecewise linear."""
 
     kind: Literal["splines"] = "splines"
@@ -105,8 +133,12 @@ class Splines(Settings):
         # before the start the clipped splines stand still at (1, 0, 0, ...): without the first, at zero
         return np.asarray(values[1:] if self.start > 0 else values)
 
+    def stretched(self, share: float) -> Self:
+        """Return the splines with their start moved along."""
+        return self.model_copy(update={"start": round(self.start * share)})
 
-class Fourier(Settings):
+
+class Fourier(TimeFunction):
     """sin and cos of the step, over a period in steps."""
 
     kind: Literal["fourier"] = "fourier"
@@ -121,8 +153,12 @@ class Fourier(Settings):
         phase = 2 * np.pi * np.arange(1, self.harmonics + 1)[:, None] * np.arange(len(series)) / self.period
         return np.round(np.concatenate([np.sin(phase), np.cos(phase)]), 12)
 
+    def stretched(self, share: float) -> Self:
+        """Return the waves with their period, in whole steps, made longer."""
+        return self.model_copy(update={"period": float(round(self.period * share))})
 
-class Steps(Settings):
+
+class Steps(TimeFunction):
     """One function for each step: no time regularisation at all."""
 
     kind: Literal["steps"] = "steps"
@@ -133,13 +169,11 @@ class Steps(Settings):
         return np.eye(len(series))
 
 
-TimeFunctions = Annotated[Force | Angle | Polynomial | Ramp | Splines | Fourier | Steps, Field(discriminator="kind")]
-
-PAPER: tuple[TimeFunctions, ...] = (Force(), Angle(), Polynomial(degree=1), Ramp(start=50, powers=(1, 2)))
+PAPER: tuple[TimeFunction, ...] = (Force(), Angle(), Polynomial(degree=1), Ramp(start=50, powers=(1, 2)))
 """Table 1 of the paper: T(t), sin, cos, 1, t, max(t - 50, 0), max(t - 50, 0)^2."""
 
 
-def time_basis(parts: tuple[TimeFunctions, ...], series: Series) -> Floats:
+def time_basis(parts: tuple[TimeFunction, ...], series: Series) -> Floats:
     """Return orthonormal time functions (function, step) that span all parts.
 
     Raises ValueError where nothing is left of them.
@@ -159,15 +193,9 @@ def time_basis(parts: tuple[TimeFunctions, ...], series: Series) -> Floats:
     return np.stack(kept) * np.sqrt(len(series))
 
 
-def with_onset(parts: tuple[TimeFunctions, ...], series: Series) -> tuple[TimeFunctions, ...]:
-    """Return the time functions with the onset of loading as a step, where the force shows one."""
-    found = onset(series.force_N)
-    return tuple(
-        part.model_copy(update={"start": found})
-        if isinstance(part, Ramp) and part.start == "onset" and found is not None
-        else part
-        for part in parts
-    )
+def settled(parts: tuple[TimeFunction, ...], series: Series) -> tuple[TimeFunction, ...]:
+    """Return the time functions with what they leave to the data filled in, where the data tell it."""
+    return tuple(part.settled(series) for part in parts)
 
 
 def _unit(count: int) -> Floats:

@@ -12,22 +12,19 @@ from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
 from pdvc.equations import memory_bytes
 from pdvc.examination import Examination
 from pdvc.experiment import Experiment
-from pdvc.history import time_basis, with_onset
-from pdvc.options import MeasureOptions, StageOptions, resolved
-from pdvc.preparation import bases, calibrated
+from pdvc.options import MeasureOptions
 from pdvc.progress import Progress, silent
 from pdvc.projection import normal_equations
 from pdvc.rays import ray_vectors
-from pdvc.sections import SectionBasis
-from pdvc.store import Store
+from pdvc.setup import Setup, set_up
 from pdvc.verdict import Doubt
-from pdvc.volume import Hull, Volume
-from pdvc.window import scan_grid, used_window
+from pdvc.volume import Volume
+from pdvc.window import scan_grid
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Hold what a measurement is expected to take on this machine, to about a factor of two."""
+    """What a measurement is expected to take on this machine, to about a factor of two."""
 
     seconds: float
     memory_gib: float
@@ -36,7 +33,7 @@ class Cost:
 
 @dataclass(frozen=True, kw_only=True)
 class Inspection:
-    """Hold what a folder holds, and what measuring it with the given options would do."""
+    """What a folder holds, and what measuring it with the given options would do."""
 
     found: Examination
     window: tuple[int, int, int, int]
@@ -51,32 +48,21 @@ def inspect(experiment: Experiment, options: MeasureOptions, *, progress: Progre
     Raises ValueError, in one line, where the data cannot be used.
     """
     found = usable(experiment, progress=progress)
-    options = resolved(options, experiment.geometry)
-    options = options.model_copy(update={"time": with_onset(options.time, experiment.test)})
     started = time.perf_counter()
-    outline = calibrated(experiment, options, Store(None, experiment), progress)[1]
+    setup = set_up(experiment, options, progress=progress)
     outlining = time.perf_counter() - started
-    window = used_window(experiment.geometry, options, outline.hull)
-    basis = bases(experiment.geometry, window, outline.hull, options)[1]
     return Inspection(
         found=found,
-        window=window,
-        cost=_cost(experiment, options, window, outline.hull, basis, outlining, progress),
-        doubts=(*doubts_of_data(found, experiment), *doubts_of_time(options.time, experiment.test)),
+        window=setup.window,
+        cost=_cost(setup, outlining, progress),
+        doubts=(*doubts_of_data(found, experiment), *doubts_of_time(setup.options.time, experiment.test)),
     )
 
 
-def _cost(
-    experiment: Experiment,
-    options: MeasureOptions,
-    window: tuple[int, int, int, int],
-    hull: Hull,
-    basis: SectionBasis,
-    outlining_s: float,
-    progress: Progress,
-) -> Cost:
+def _cost(setup: Setup, outlining_s: float, progress: Progress) -> Cost:
     """Time one radiograph on a volume as large as that of scale 1, and count passes, voxels and pixels."""
-    geometry, steps = experiment.geometry, len(experiment.test)
+    experiment, geometry, window, basis = setup.experiment, setup.geometry, setup.window, setup.sections
+    steps, hull = len(experiment.test), setup.outline.hull
     compile_kernels(progress=progress)
     grid = scan_grid(geometry, hull)
     volume = Volume(values=np.ones(grid.shape, dtype=np.float32), grid=grid, hull=hull)
@@ -88,12 +74,14 @@ def _cost(
     )
     pass_s = steps * (time.perf_counter() - started)
     # two residual fields, and what propagating the noise takes
-    passes = sum(_passes(stage) for stage in (*options.rigid, *options.deformation)) + 3
+    stages = (*setup.options.rigid, *setup.options.deformation)
+    # at a coarser scale rays are fewer and shorter
+    passes = sum(stage.solver.passes / stage.scale**2 for stage in stages) + 3
     voxels, reference = float(np.prod(grid.shape)), experiment.reference.counts
     # the outline took two coarse reconstructions of some 150 views; scale 1 has more of both
     rows = min(geometry.rows, 240)
     finer = (geometry.rows / rows) ** 3 * len(reference) / min(len(reference), 150)
-    time_functions = time_basis(options.time, experiment.test)
+    time_functions = setup.time_functions()
     pixels = float(geometry.rows * geometry.columns)
     memory = 8 * voxels + 4 * pixels * len(reference) / 2 + 24 * steps * target.size
     memory += memory_bytes(time_functions, basis)
@@ -102,10 +90,3 @@ def _cost(
         memory_gib=memory / 2**30 + 0.3,
         unknowns=len(time_functions) * basis.shape[0] * basis.shape[1],
     )
-
-
-def _passes(stage: StageOptions) -> float:
-    """Return how many passes of scale 1 a stage may take: at a coarser scale rays are fewer and shorter."""
-    assert isinstance(stage.scale, int), "options are resolved"
-    each = stage.passes_per_mode if stage.solver == "pgd" else 1
-    return (stage.most * each * 0.6 + 1) / stage.scale**2

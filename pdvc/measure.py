@@ -17,26 +17,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc import gauss_newton, pgd
 from pdvc.compilation import compile_kernels
 from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
+from pdvc.deviations import step_covariance, turned_std
 from pdvc.equations import Equations, check_size, linearise, residuals
 from pdvc.experiment import Experiment
-from pdvc.history import time_basis, with_onset
-from pdvc.measurement import Measurement, Stage, step_covariance, turned_std
+from pdvc.history import settled
+from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Stage
 from pdvc.noise import known_from_residual, propagate
-from pdvc.options import MeasureOptions, StageOptions, resolved
-from pdvc.preparation import Prepared, bases, calibrated, noise_of, prepare, snr_of
-from pdvc.prior import Prior
+from pdvc.options import MeasureOptions, ResolvedStage, StageOptions
+from pdvc.preparation import Prepared, noise_of, prepare, snr_of
 from pdvc.progress import Progress, silent
 from pdvc.result_checks import check_finite, doubts_of_result
 from pdvc.sections import SectionBasis
-from pdvc.solution import Solution
-from pdvc.store import Store
+from pdvc.setup import Setup, set_up
+from pdvc.solution import Problem, Solution
 from pdvc.uncertainty import posterior
 from pdvc.verdict import Stop, Verdict, explained_by
 from pdvc.volume import Volume
-from pdvc.window import used_window
 
 __all__ = ["MeasureOptions", "StageOptions", "measure"]
 
@@ -55,55 +53,44 @@ def measure(
     compile_kernels(progress=progress)
     compiling = time.perf_counter() - compiling
     examining = time.perf_counter()
-    options = resolved(options, experiment.geometry)
-    options = options.model_copy(update={"time": with_onset(options.time, experiment.test)})
     examined = usable(experiment, progress=progress)
-    doubts = (*doubts_of_data(examined, experiment), *doubts_of_time(options.time, experiment.test))
+    time_parts = settled(options.time, experiment.test)
+    doubts = (*doubts_of_data(examined, experiment), *doubts_of_time(time_parts, experiment.test))
     examining = time.perf_counter() - examining
     with explained_by(doubts):
-        found, volume = _measured(experiment, options, Store(work, experiment), progress)
+        found, volume = _measured(experiment, options, work, progress)
     after = doubts_of_result(found, volume, experiment.geometry, options.prior_voxel)
     verdict = Verdict(doubts=(*doubts, *after))
     with explained_by(verdict.doubts):
         check_finite(found)
-    return replace(
-        found,
-        verdict=verdict,
-        seconds={"compile": compiling, "examine": examining, **found.seconds},
-    )
+    seconds = {"compile": compiling, "examine": examining, **found.provenance.seconds}
+    return replace(found, verdict=verdict, provenance=replace(found.provenance, seconds=seconds))
 
 
 def _measured(
-    experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress
+    experiment: Experiment, options: MeasureOptions, work: Path | None, progress: Progress
 ) -> tuple[Measurement, Volume]:
     """Return a measurement without a verdict, and the reference volume at scale 1."""
     started = time.perf_counter()
-    time_functions = time_basis(options.time, experiment.test)
-    calibration, outline = calibrated(experiment, options, store, progress)
-    window = used_window(experiment.geometry, options, outline.hull)
-    options = options.model_copy(update={"discard_rows": window[0], "discard_columns": window[2]})
-    rigid, sections = bases(experiment.geometry, window, outline.hull, options)
+    setup = set_up(experiment, options, work=work, progress=progress)
+    rigid, sections, time_functions = setup.rigid, setup.sections, setup.time_functions()
     check_size(time_functions, sections)
-    scales = {_scale(stage) for stage in (*options.rigid, *options.deformation)}
-    prepared = {
-        scale: prepare(experiment, calibration, outline, window, scale, options, store, progress)
-        for scale in sorted(scales, reverse=True)
-    }
+    prepared = {scale: prepare(setup, scale, progress) for scale in setup.options.scales}
     fine = prepared[1]
     solving = time.perf_counter()
-    solver = _Solver(prepared, time_functions, options, store, progress)
-    start = solver.run("rigid", rigid, options.rigid, np.zeros((len(time_functions), *rigid.shape)))
-    start = sections.rigid(start, rigid)
+    solver = _Protocol(setup, prepared, progress)
+    start = solver.run("rigid", rigid, setup.options.rigid, np.zeros((len(time_functions), *rigid.shape)))
+    start = sections.reproduced(start, rigid)
     standing = np.zeros((len(experiment.test), *sections.shape))
     initial = residuals(fine.images, sections, standing, progress=progress, task="initial residual")
     moved = np.einsum("ft,fjk->tjk", time_functions, start)
     after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
-    coefficients = solver.run("deformation", sections, options.deformation, start)
+    coefficients = solver.run("deformation", sections, setup.options.deformation, start)
     equations = solver.equations_at(sections, coefficients)
     amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
     propagating = time.perf_counter()
-    noise = noise_of(experiment, calibration, fine, options.smooth_px) or known_from_residual(
-        equations.rms, fine.systematic.shape, fine.systematic.fields.shape[1:], options.smooth_px
+    noise = noise_of(setup, fine) or known_from_residual(
+        equations.rms, fine.systematic.shape, fine.systematic.fields.shape[1:], setup.options.smooth_px
     )
     propagated = propagate(
         fine.images,
@@ -117,47 +104,47 @@ def _measured(
     )
     task = f"covariance of {len(time_functions) * standing[0].size} unknowns"
     progress(task, 0, 1)
-    known = posterior(equations, time_functions, _prior(sections, options), propagated.parts)
+    known = posterior(equations, time_functions, setup.prior(sections), propagated.parts)
     progress(task, 1, 1)
     amplitude[:, ~known.observed] = np.nan
     snr = snr_of(fine.images)
     ended = time.perf_counter()
     found = Measurement(
-        title=experiment.title,
-        voxel_mm=experiment.geometry.voxel_mm,
-        source_axis_mm=experiment.geometry.source_axis_mm,
-        angle_rad=experiment.test.angle_rad,
-        time_s=experiment.test.time_s,
-        force_N=experiment.test.force_N,
-        window=window,
-        basis=sections,
-        time_functions=time_functions,
-        amplitude=amplitude,
-        covariance=known.covariance,
-        amplitude_std=np.where(known.observed[:, None], known.deviation, np.nan),
-        data_share=np.where(known.observed[:, None], known.data_share, 0.0),
-        observed=known.observed,
-        stages=tuple(solver.stages),
-        snr_reprojection_db=fine.snr_reprojection_db,
-        snr_initial_db=snr(initial),
-        snr_rigid_db=snr(after_rigid),
-        snr_final_db=snr(equations.residual),
-        snr_noise_db=fine.snr_noise_db,
-        residual_initial=initial,
-        residual_rigid=after_rigid,
-        residual_final=equations.residual,
-        residual_tests=propagated.tests,
-        std_by_source={
-            name: _on_the_axis(part, sections, known.observed, time_functions, experiment.test.angle_rad)
-            for name, part in known.by_source.items()
-        },
-        seconds={
-            "reconstruct": solving - started,
-            "measure": propagating - solving,
-            "uncertainty": ended - propagating,
-        },
-        options=options.template(),
-        versions=versions(),
+        recording=setup.recording(),
+        motion=MeasuredMotion(
+            basis=sections,
+            time_functions=time_functions,
+            amplitude=amplitude,
+            covariance=known.covariance,
+            amplitude_std=np.where(known.observed[:, None], known.deviation, np.nan),
+            data_share=np.where(known.observed[:, None], known.data_share, 0.0),
+            observed=known.observed,
+            std_by_source={
+                name: _on_the_axis(part, sections, known.observed, time_functions, experiment.test.angle_rad)
+                for name, part in known.by_source.items()
+            },
+        ),
+        fit=Fit(
+            stages=tuple(solver.stages),
+            snr_reprojection_db=fine.snr_reprojection_db,
+            snr_initial_db=snr(initial),
+            snr_rigid_db=snr(after_rigid),
+            snr_final_db=snr(equations.residual),
+            snr_noise_db=fine.snr_noise_db,
+            residual_initial=initial,
+            residual_rigid=after_rigid,
+            residual_final=equations.residual,
+            residual_tests=propagated.tests,
+        ),
+        provenance=Provenance(
+            seconds={
+                "reconstruct": solving - started,
+                "measure": propagating - solving,
+                "uncertainty": ended - propagating,
+            },
+            options=setup.options.template(),
+            versions=versions(),
+        ),
     )
     return found, fine.images.volume
 
@@ -176,42 +163,30 @@ def _on_the_axis(
     return across, vertical, along
 
 
-def _prior(basis: SectionBasis, options: MeasureOptions) -> Prior:
-    return Prior(deviation_voxel=np.full(basis.shape, options.prior_voxel))
+class _Protocol:
+    """The stages of a measurement, one after the other: what each found, and the last equations."""
 
-
-class _Solver:
-    """Run stages one after the other, keep what each found, and remember the last equations."""
-
-    def __init__(
-        self,
-        prepared: Mapping[int, Prepared],
-        time_functions: Floats,
-        options: MeasureOptions,
-        store: Store,
-        progress: Progress,
-    ) -> None:
+    def __init__(self, setup: Setup, prepared: Mapping[int, Prepared], progress: Progress) -> None:
         self.stages: list[Stage] = []
+        self._setup = setup
         self._prepared = prepared
-        self._time_functions = time_functions
-        self._options = options
-        self._store = store
+        self._time_functions = setup.time_functions()
         self._progress = progress
         self._last: tuple[Floats, Equations] | None = None
 
-    def run(self, name: str, basis: SectionBasis, stages: tuple[StageOptions, ...], start: Floats) -> Floats:
+    def run(self, name: str, basis: SectionBasis, stages: tuple[ResolvedStage, ...], start: Floats) -> Floats:
         """Solve the stages in turn from a start (function, section, motion), voxels; return where they end."""
         for stage in stages:
-            kept = self._store.arrays(
+            kept = self._setup.store.arrays(
                 "stage",
-                (name, self._options, stage, basis, self._time_functions, start),
+                (name, self._setup.options, stage, basis, self._time_functions, start),
                 lambda stage=stage, start=start: _packed(self._solved(name, basis, stage, start)),  # type: ignore[misc]
             )
             self.stages.append(
                 Stage(
                     name=name,
-                    scale=_scale(stage),
-                    solver=stage.solver,
+                    scale=stage.scale,
+                    solver=stage.solver.kind,
                     unknowns=len(self._time_functions) * basis.shape[0] * basis.shape[1],
                     temporal=kept["temporal"],
                     spatial=kept["spatial"],
@@ -231,8 +206,8 @@ class _Solver:
         amplitude = np.einsum("ft,fjk->tjk", self._time_functions, coefficients)
         return linearise(self._prepared[1].images, basis, amplitude, progress=self._progress, task="last pass")
 
-    def _solved(self, name: str, basis: SectionBasis, stage: StageOptions, start: Floats) -> Solution:
-        prepared, passes = self._prepared[_scale(stage)], 0
+    def _solved(self, name: str, basis: SectionBasis, stage: ResolvedStage, start: Floats) -> Solution:
+        prepared, passes = self._prepared[stage.scale], 0
 
         def at(amplitude: Floats) -> Equations:
             nonlocal passes
@@ -240,27 +215,16 @@ class _Solver:
             task = f"{name}, scale {stage.scale}, pass {passes}"
             return linearise(prepared.images, basis, amplitude, progress=self._progress, task=task)
 
-        prior = _prior(basis, self._options)
-        if stage.solver == "pgd":
-            solution = pgd.solve(
-                at,
-                self._time_functions,
-                start,
-                prior,
-                most_modes=stage.most,
-                passes_per_mode=stage.passes_per_mode,
-                least_gain=stage.least_gain,
+        solution = stage.solver.solve(
+            Problem(
+                linearise=at,
+                time_functions=self._time_functions,
+                start=start,
+                prior=self._setup.prior(basis),
+                # as long as the sample only moves as a whole, what is left is not noise
                 noise_rms=prepared.noise_rms if name == "deformation" else None,
             )
-        else:
-            solution = gauss_newton.solve(
-                at,
-                self._time_functions,
-                start,
-                prior,
-                most_passes=stage.most,
-                least_change_voxel=stage.least_change_voxel,
-            )
+        )
         self._last = (solution.coefficients, solution.equations)
         return solution
 
@@ -275,11 +239,6 @@ def _packed(solution: Solution) -> dict[str, NDArray[Any]]:
         "stop_reason": np.array(solution.stop_reason),
         "last_change": np.array(solution.last_change_voxel),
     }
-
-
-def _scale(stage: StageOptions) -> int:
-    assert isinstance(stage.scale, int), "options are resolved"
-    return stage.scale
 
 
 def versions() -> str:

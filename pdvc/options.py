@@ -7,38 +7,54 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
+from pdvc.experiment import Experiment
+from pdvc.gauss_newton import GaussNewton
 from pdvc.geometry import ConeBeam
-from pdvc.history import PAPER, Ramp, TimeFunctions
-from pdvc.sections import CONTRACTION, RIGID, SectionBasis
+from pdvc.history import PAPER, Ramp, TimeFunction, settled
+from pdvc.pgd import Pgd
+from pdvc.sections import CONTRACTION, RIGID, motions_named, names_of
 from pdvc.settings import Settings
-
-
-class StageOptions(Settings):
-    """One stage: at which scale, by which solver, how far."""
-
-    scale: Annotated[int, Field(ge=1, le=16)] | Literal["coarse"] = 1
-    """pixels binned into one; coarse: the largest power of two that leaves about a hundred rows"""
-    solver: Literal["pgd", "gauss-newton"] = "pgd"
-    """pgd: greedy modes, as in the paper; gauss-newton: all unknowns at once"""
-    most: Annotated[int, Field(ge=1)] = 4
-    """largest number of modes (pgd) or passes (gauss-newton)"""
-    passes_per_mode: Annotated[int, Field(ge=1)] = 1
-    """pgd: linearisations about each mode, while they help; one in the paper"""
-    least_gain: Annotated[float, Field(ge=0, lt=1)] = 1e-3
-    """pgd stops at a mode that lowers the rms residual by less than this share"""
-    least_change_voxel: Annotated[float, Field(gt=0)] = 2e-3
-    """gauss-newton stops at a change of displacement below this, voxel rms"""
-
+from pdvc.solution import Solver
 
 COARSE_ROWS = 100
 """Rows that the coarse scale leaves at least."""
+
+Scale = Annotated[int, Field(ge=1, le=16)]
+
+
+class StageOptions(Settings):
+    """One stage of the protocol: at which scale, and by which solver."""
+
+    scale: Scale | Literal["coarse"] = 1
+    """pixels binned into one; coarse: the largest power of two that leaves about a hundred rows"""
+    solver: Solver = Pgd()
+    """pgd or gauss-newton, each with its own limits"""
+
+    def at(self, geometry: ConeBeam) -> ResolvedStage:
+        """Return the stage with its scale as a number, for a detector."""
+        scale = coarse_scale(geometry) if self.scale == "coarse" else self.scale
+        return ResolvedStage(scale=scale, solver=self.solver)
+
+
+class ResolvedStage(StageOptions):
+    """A stage of one experiment's protocol."""
+
+    scale: Scale = 1
+    """pixels binned into one"""
+
+
+def coarse_scale(geometry: ConeBeam) -> int:
+    """Return the largest power of two, up to 16, that leaves about a hundred rows."""
+    return max(scale for scale in (1, 2, 4, 8, 16) if scale == 1 or geometry.rows >= COARSE_ROWS * scale)
+
+
 COARSE_TO_FINE_RIGID = (
-    StageOptions(scale="coarse", most=3, passes_per_mode=6),
-    StageOptions(scale=2, most=5, passes_per_mode=3),
+    StageOptions(scale="coarse", solver=Pgd(most_modes=3, passes_per_mode=6)),
+    StageOptions(scale=2, solver=Pgd(most_modes=5, passes_per_mode=3)),
 )
 COARSE_TO_FINE = (
-    StageOptions(scale=2, most=4, passes_per_mode=8),
-    StageOptions(scale=1, solver="gauss-newton", most=4),
+    StageOptions(scale=2, solver=Pgd(most_modes=4, passes_per_mode=8)),
+    StageOptions(scale=1, solver=GaussNewton(most_passes=4)),
 )
 
 
@@ -55,9 +71,9 @@ class MeasureOptions(Settings):
     """columns left out on the left and on the right, px; default: 60 of 432, or less for a wide sample"""
     sections: Annotated[int, Field(ge=2)] = 15
     """sections, equally spaced over the used height"""
-    section_motions: tuple[str, ...] = (*RIGID, CONTRACTION)
+    section_motions: tuple[str, ...] = names_of((*RIGID, CONTRACTION))
     """motions of a section: six rigid ones, and contraction"""
-    time: tuple[TimeFunctions, ...] = (*PAPER[:3], Ramp(powers=(0, 1, 2, 3)))
+    time: tuple[TimeFunction, ...] = (*PAPER[:3], Ramp(powers=(0, 1, 2, 3)))
     """time functions: Table 1, and a jump and a cube at the start of loading"""
     rigid: tuple[StageOptions, ...] = COARSE_TO_FINE_RIGID
     """the sample as one rigid body; one stage or several, from coarse to fine"""
@@ -91,48 +107,65 @@ class MeasureOptions(Settings):
     @field_validator("section_motions")
     @classmethod
     def _known_motions(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        SectionBasis(height_mm=[0.0], radius_mm=1.0, motions=names)  # type: ignore[arg-type]  # raises if unknown
+        motions_named(names)  # raises if one is unknown
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"every motion once, {', '.join(twice)} stands there twice")
         return names
 
 
-def coarse_scale(geometry: ConeBeam) -> int:
-    """Return the largest power of two, up to 16, that leaves about a hundred rows."""
-    return max(scale for scale in (1, 2, 4, 8, 16) if scale == 1 or geometry.rows >= COARSE_ROWS * scale)
+class ResolvedOptions(MeasureOptions):
+    """Options of one experiment: nothing is left to its detector or its data any more."""
+
+    discard_rows: Annotated[int, Field(ge=0)]
+    """rows left out at the top and at the bottom, px"""
+    discard_columns: Annotated[int, Field(ge=0)]
+    """columns left out on the left and on the right, px"""
+    rigid: tuple[ResolvedStage, ...]
+    """the sample as one rigid body; one stage or several, from coarse to fine"""
+    deformation: tuple[ResolvedStage, ...]
+    """every section by itself; one stage or several, the last at scale 1"""
+
+    @property
+    def scales(self) -> tuple[int, ...]:
+        """Return the scales of all stages, coarsest first."""
+        return tuple(sorted({stage.scale for stage in (*self.rigid, *self.deformation)}, reverse=True))
 
 
-def resolved(options: MeasureOptions, geometry: ConeBeam) -> MeasureOptions:
-    """Return the options with everything filled in that depends on the detector alone: the coarse scale.
+def resolved(
+    options: MeasureOptions, experiment: Experiment, discard_rows: int, discard_columns: int
+) -> ResolvedOptions:
+    """Return the options of an experiment, with what they leave open filled in: stages, onsets, and the window."""
+    given = {name: getattr(options, name) for name in MeasureOptions.model_fields}
+    found = {
+        "discard_rows": discard_rows,
+        "discard_columns": discard_columns,
+        "time": settled(options.time, experiment.test),
+        "rigid": tuple(stage.at(experiment.geometry) for stage in options.rigid),
+        "deformation": tuple(stage.at(experiment.geometry) for stage in options.deformation),
+    }
+    return ResolvedOptions(**{**given, **found})
 
-    Raises ValueError where nothing of the radiographs would be left.
-    """
-    rows, columns = options.discard_rows or 0, options.discard_columns or 0
+
+def check_discarded(options: MeasureOptions, geometry: ConeBeam) -> None:
+    """Raise ValueError where nothing of the radiographs would be left."""
+    rows = 0 if options.discard_rows is None else options.discard_rows
+    columns = 0 if options.discard_columns is None else options.discard_columns
     if 2 * rows >= geometry.rows or 2 * columns >= geometry.columns:
         raise ValueError(
             f"discard_rows, discard_columns: expected to leave some of {geometry.rows} x {geometry.columns} px, "
             f"got {rows} and {columns} px on each side"
         )
-    coarse = coarse_scale(geometry)
-    stages = {
-        name: tuple(
-            stage.model_copy(update={"scale": coarse}) if stage.scale == "coarse" else stage
-            for stage in getattr(options, name)
-        )
-        for name in ("rigid", "deformation")
-    }
-    return options.model_copy(update=stages)
 
 
 def paper_options() -> MeasureOptions:
     """Return the paper's protocol: Table 1, six motions a section, eight modes at scale 2, four at scale 1."""
     return MeasureOptions(
-        section_motions=RIGID,
+        section_motions=names_of(RIGID),
         time=PAPER,
         smooth_px=0.0,
-        rigid=(StageOptions(scale=2, most=8),),
-        deformation=(StageOptions(scale=1, most=4),),
+        rigid=(StageOptions(scale=2, solver=Pgd(most_modes=8)),),
+        deformation=(StageOptions(scale=1, solver=Pgd(most_modes=4)),),
     )
 
 

@@ -13,13 +13,15 @@ the noise criterion compares chi^2 with 2 gamma^2 N_pix (both squared; 2 for noi
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior, solved
-from pdvc.solution import SHORTER, Solution, evaluated, lowers
+from pdvc.solution import SHORTER, Problem, Solution, Solver, evaluated, lowers
 from pdvc.verdict import Stop
 
 Floats = NDArray[np.float64]
@@ -28,6 +30,37 @@ FIXED_POINT_TOLERANCE = 1e-6
 FIXED_POINT_MOST = 500
 WORTH_A_PASS = 0.005
 """A mode is found again about itself as long as that lowers the residual by more than this share."""
+
+
+class Pgd(Solver):
+    """Greedy space-time modes, one at a time, as in the paper."""
+
+    kind: Literal["pgd"] = "pgd"
+    """greedy space-time modes, one at a time, as in the paper"""
+    most_modes: Annotated[int, Field(ge=1)] = 4
+    """largest number of modes"""
+    passes_per_mode: Annotated[int, Field(ge=1)] = 1
+    """linearisations about each mode, while they help; one in the paper"""
+    least_gain: Annotated[float, Field(ge=0, lt=1)] = 1e-3
+    """a mode that lowers the rms residual by less than this share is the last"""
+
+    def solve(self, problem: Problem) -> Solution:
+        """Add modes until the residual is noise, stops falling, or there are as many as allowed."""
+        return solve(
+            problem.linearise,
+            problem.time_functions,
+            problem.start,
+            problem.prior,
+            most_modes=self.most_modes,
+            passes_per_mode=self.passes_per_mode,
+            least_gain=self.least_gain,
+            noise_rms=problem.noise_rms,
+        )
+
+    @property
+    def passes(self) -> float:
+        """Return about how many passes over all radiographs it may take: few modes need all that are allowed."""
+        return self.most_modes * self.passes_per_mode * 0.6 + 1
 
 
 def solve(

@@ -1,4 +1,4 @@
-"""What every solver starts from: calibration, outline, and for each scale the volume and the radiographs."""
+"""What every solver starts from at a scale: the volume at rest, the radiographs, and what is known of their noise."""
 
 from __future__ import annotations
 
@@ -10,20 +10,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc.beam_hardening import Outline, find_outline
 from pdvc.equations import Images
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
 from pdvc.noise import ImageNoise, Noise
-from pdvc.options import MeasureOptions, resolved
+from pdvc.options import MeasureOptions
 from pdvc.progress import Progress, silent
 from pdvc.projection import project_at_rest
 from pdvc.radiographs import (
-    IDENTITY,
     Calibration,
     DetectorNoise,
     binned,
-    calibrate,
     coarsened,
     detector_noise,
     grey_levels,
@@ -33,25 +30,21 @@ from pdvc.radiographs import (
 )
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import fdk
-from pdvc.sections import RIGID, SectionBasis
-from pdvc.store import Keep, Store
+from pdvc.setup import Setup, set_up
+from pdvc.store import Keep
 from pdvc.systematic import Neighbours, Systematic, neighbouring_views
 from pdvc.volume import Hull, Volume
-from pdvc.window import height_mm, reached_rows, scan_grid
+from pdvc.window import reached_rows, scan_grid
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-_OUTLINE_ROWS = 240
-"""The outline is found on radiographs binned to about this many rows."""
-_OUTLINE_VIEWS = 150
 _HULL_MARGIN_VOXEL = 3.0
-ROWS_OF_A_SECTION = 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:
-    """Hold one scale's images with what was learnt on the way."""
+    """The images of one scale, with what was learnt on the way."""
 
     images: Images
     systematic: Systematic
@@ -63,90 +56,17 @@ class Prepared:
     noise_rms: float | None
 
 
-def calibrated(
-    experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress
-) -> tuple[Calibration, Outline]:
-    """Return the detector's calibration, with the beam-hardening polynomial, and the sample's outline."""
-    calibration = calibrate(experiment)
-    given = {"fit": None, "none": IDENTITY}.get(str(options.beam_hardening), options.beam_hardening)
-    polynomial = given if isinstance(given, tuple) else None
-    keep = partial(store.of_reference, "outline", (calibration, polynomial))
-    outline = outlined(experiment.reference, experiment.geometry, calibration, polynomial, keep, progress)
-    return calibration.with_polynomial(outline.polynomial), outline
-
-
-def outlined(
-    series: Series,
-    geometry: ConeBeam,
-    calibration: Calibration,
-    polynomial: tuple[float, float, float] | None,
-    keep: Keep,
-    progress: Progress,
-) -> Outline:
-    """Return the sample's outline in a full scan; `calibration` without beam hardening, else as in `find_outline`."""
-    factor = max(1, round(geometry.rows / _OUTLINE_ROWS))
-    chosen = np.unique(np.linspace(0, len(series), min(_OUTLINE_VIEWS, len(series)), endpoint=False).astype(int))
-
-    def view(i: int) -> Image:
-        return binned(grey_levels(series.counts[chosen[i]], calibration), factor)
-
-    def found() -> dict[str, Floats]:
-        outline = find_outline(view, geometry.binned(factor), series.angle_rad[chosen], polynomial, progress=progress)
-        hull = outline.hull
-        return {
-            "place_mm": np.array([hull.z_mm, hull.slab_mm]),
-            "support_mm": hull.support_mm,
-            "polynomial": np.array(outline.polynomial),
-        }
-
-    kept = keep(found)
-    z_mm, slab_mm = kept["place_mm"]
-    c1, c2, c3 = (float(c) for c in kept["polynomial"])
-    return Outline(
-        hull=Hull(z_mm=float(z_mm), slab_mm=float(slab_mm), support_mm=kept["support_mm"]), polynomial=(c1, c2, c3)
-    )
-
-
-def bases(
-    geometry: ConeBeam, window: tuple[int, int, int, int], hull: Hull, options: MeasureOptions
-) -> tuple[SectionBasis, SectionBasis]:
-    """Return the rigid basis, one section, and the section basis, spread over the used height.
-
-    Raises ValueError for sections closer to each other than two rows.
-    """
-    if options.sections > max((window[1] - window[0]) / ROWS_OF_A_SECTION, 2):
-        raise ValueError(
-            f"sections: expected at most one for every {ROWS_OF_A_SECTION} of the {window[1] - window[0]} used rows, "
-            f"got {options.sections}"
-        )
-    low, high = hull.box_mm()
-    radius = float(np.hypot(*(high - low)[:2]) / 4)
-    top = height_mm(geometry, window[0] - 0.5)
-    bottom = height_mm(geometry, window[1] - 0.5)
-    heights = np.linspace(bottom, top, options.sections)
-    rigid = SectionBasis(height_mm=np.array([(top + bottom) / 2]), radius_mm=radius, motions=RIGID)
-    return rigid, SectionBasis(height_mm=heights, radius_mm=radius, motions=options.section_motions)
-
-
-def prepare(
-    experiment: Experiment,
-    calibration: Calibration,
-    outline: Outline,
-    window: tuple[int, int, int, int],
-    scale: int,
-    options: MeasureOptions,
-    store: Store,
-    progress: Progress,
-) -> Prepared:
+def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:
     """Prepare one scale: volume, radiographs of the window, weights, systematic residual."""
+    experiment, options = setup.experiment, setup.options
     geometry = experiment.geometry.binned(scale)
-    part = tuple(edge // scale for edge in window)
+    part = tuple(edge // scale for edge in setup.window)
     used = geometry.cropped(*part)
-    view = _viewer(experiment.reference, calibration, scale, options.smooth_px)
-    volume = reference_volume(experiment, calibration, outline.hull, scale, options, store, progress)
+    view = _viewer(experiment.reference, setup.calibration, scale, options.smooth_px)
+    volume = reference_volume(setup, scale, progress)
     systematic, views, snr_reprojection = _systematic(experiment, geometry, part, view, volume, progress)
-    grey, variance = _test_radiographs(experiment, calibration, part, scale, options.smooth_px, progress)
-    good = ~_coarse_bad(calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
+    grey, variance = _test_radiographs(experiment, setup.calibration, part, scale, options.smooth_px, progress)
+    good = ~_coarse_bad(setup.calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
     if not good.any():
         raise ValueError("mask: expected some used pixels, but all of the window are bad")
     weight = good[None].astype(np.float32)
@@ -183,16 +103,14 @@ def keep_volumes(
     Every measurement that works in this folder (`measure(..., work=folder)`), of an experiment with the same
     reference scan, finds it there: see `volume_choices`.
     """
-    store = Store(folder, experiment)
-    calibration, outline = calibrated(experiment, options, store, progress)
-    options = resolved(options, experiment.geometry)
-    for scale in volume_choices(options)[0]:
-        reference_volume(experiment, calibration, outline.hull, scale, options, store, progress)
+    setup = set_up(experiment, options, work=folder, progress=progress)
+    for scale in setup.options.scales:
+        reference_volume(setup, scale, progress)
 
 
-def volume_choices(options: MeasureOptions) -> tuple[tuple[int, ...], object, float]:
-    """Return what volumes depend on, of resolved options: scales, coarsest first, beam hardening, and filter."""
-    scales = {stage.scale for stage in (*options.rigid, *options.deformation) if isinstance(stage.scale, int)}
+def volume_choices(options: MeasureOptions, geometry: ConeBeam) -> tuple[tuple[int, ...], object, float]:
+    """Return what volumes of a scanner depend on, of some options: scales, beam hardening, and filter."""
+    scales = {stage.at(geometry).scale for stage in (*options.rigid, *options.deformation)}
     return tuple(sorted(scales, reverse=True)), options.beam_hardening, options.smooth_px
 
 
@@ -203,19 +121,12 @@ def _viewer(series: Series, calibration: Calibration, scale: int, smooth_px: flo
     return view
 
 
-def reference_volume(
-    experiment: Experiment,
-    calibration: Calibration,
-    hull: Hull,
-    scale: int,
-    options: MeasureOptions,
-    store: Store,
-    progress: Progress,
-) -> Volume:
+def reference_volume(setup: Setup, scale: int, progress: Progress = silent) -> Volume:
     """Reconstruct the reference scan at a scale; every experiment with the same reference scan finds it kept."""
-    keep = partial(store.of_reference, "volume", (calibration, hull, scale, options.smooth_px))
-    series, geometry = experiment.reference, experiment.geometry
-    return scan_volume(series, geometry, calibration, hull, scale, options.smooth_px, keep, progress)
+    calibration, hull, smooth_px = setup.calibration, setup.outline.hull, setup.options.smooth_px
+    keep = partial(setup.store.of_reference, "volume", (calibration, hull, scale, smooth_px))
+    series = setup.experiment.reference
+    return scan_volume(series, setup.geometry, calibration, hull, scale, smooth_px, keep, progress)
 
 
 def scan_volume(
@@ -301,8 +212,9 @@ def _test_radiographs(
     return grey, variance
 
 
-def noise_of(experiment: Experiment, calibration: Calibration, prepared: Prepared, smooth_px: float) -> Noise | None:
+def noise_of(setup: Setup, prepared: Prepared) -> Noise | None:
     """Return the noise of all images at scale 1, if the experiment's description tells of it."""
+    experiment, calibration = setup.experiment, setup.calibration
     noise = detector_noise(experiment)
     if noise is None:
         return None
@@ -320,7 +232,7 @@ def noise_of(experiment: Experiment, calibration: Calibration, prepared: Prepare
         return ImageNoise(variance=variance, slope=slope)
 
     flat = known.relative_variance(calibration.open_beam, len(experiment.flats))
-    return Noise(step=step, view=view, flat=flat, smooth_px=smooth_px)
+    return Noise(step=step, view=view, flat=flat, smooth_px=setup.options.smooth_px)
 
 
 def _noise_left(scale: int, smooth_px: float) -> float:

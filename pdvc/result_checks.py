@@ -45,7 +45,7 @@ def doubts_of_result(found: Measurement, volume: Volume, geometry: ConeBeam, pri
     """Return what speaks against a measurement; `volume` is that of scale 1, `geometry` the scanner's."""
     return (
         *_of_residuals(found),
-        *_of_motion(found, prior_voxel, np.arange(len(found.amplitude))),
+        *_of_motion(found, prior_voxel, np.arange(len(found.motion.amplitude))),
         *_of_ends(found, volume, geometry),
         *_of_window(found, volume.hull, geometry),
         *_of_convergence(found),
@@ -56,13 +56,15 @@ def doubts_of_result(found: Measurement, volume: Volume, geometry: ConeBeam, pri
 
 def doubts_of_solution(found: Measurement, prior_voxel: float) -> tuple[Doubt, ...]:
     """Return what speaks against a measurement made from full scans: its motion, at the steps that were scanned."""
-    scanned = np.isfinite(found.amplitude[:, found.observed]).all(axis=(1, 2))
-    steps = replace(found, amplitude=found.amplitude[scanned], data_share=found.data_share[scanned])
-    return (*_of_motion(steps, prior_voxel, np.flatnonzero(scanned)), *_of_convergence(found))
+    scanned = np.isfinite(found.motion.amplitude[:, found.motion.observed]).all(axis=(1, 2))
+    steps = replace(
+        found.motion, amplitude=found.motion.amplitude[scanned], data_share=found.motion.data_share[scanned]
+    )
+    return (*_of_motion(replace(found, motion=steps), prior_voxel, np.flatnonzero(scanned)), *_of_convergence(found))
 
 
 def _of_residuals(found: Measurement) -> Iterator[Doubt]:
-    again = float(np.median(found.snr_reprojection_db))
+    again = float(np.median(found.fit.snr_reprojection_db))
     if not again >= REPROJECTED_DB:
         yield Doubt(
             name="reference-volume",
@@ -71,7 +73,7 @@ def _of_residuals(found: Measurement) -> Iterator[Doubt]:
             advice="check geometry and angles of the reference scan, and that the sample did not move during it",
             fatal=not again >= NOT_REPROJECTED_DB,
         )
-    final = found.snr_final_db
+    final = found.fit.snr_final_db
     typical = float(np.median(final))
     if not typical >= EXPLAINED_DB or typical < again - WORSE_DB:
         yield Doubt(
@@ -89,7 +91,7 @@ def _of_residuals(found: Measurement) -> Iterator[Doubt]:
             advice="at these steps the motion was not found, or the radiograph is of something else",
             steps=tuple(worse.tolist()),
         )
-    tests, noise_known = found.residual_tests, bool(np.isfinite(found.snr_noise_db).any())
+    tests, noise_known = found.fit.residual_tests, bool(np.isfinite(found.fit.snr_noise_db).any())
     if tests is not None and noise_known and tests.chi2_reduced > MORE_THAN_NOISE:
         yield Doubt(
             name="more-than-noise",
@@ -106,8 +108,8 @@ def _of_residuals(found: Measurement) -> Iterator[Doubt]:
 
 def _of_motion(found: Measurement, prior_voxel: float, number: NDArray[np.intp]) -> Iterator[Doubt]:
     """Look at amplitudes; `number` are the steps they belong to."""
-    basis, seen = found.basis, found.observed
-    amplitude = found.amplitude[:, seen]
+    basis, seen = found.motion.basis, found.motion.observed
+    amplitude = found.motion.amplitude[:, seen]
     if not np.isfinite(amplitude).all():
         yield Doubt(
             name="not-finite",
@@ -122,8 +124,10 @@ def _of_motion(found: Measurement, prior_voxel: float, number: NDArray[np.intp])
             figure=f"{int((~seen).sum())} of {len(seen)} sections are not seen by any used pixel",
             advice="fewer sections, or a larger window",
         )
-    if "translation_z" in basis.motions and seen.sum() > 1:
-        vertical = amplitude[..., basis.motions.index("translation_z")] * found.voxel_mm
+    if seen.sum() > 1:
+        # what a section does to its own point of the axis
+        shift = np.array([motion.shift[2] for motion in basis.motions], dtype=float)
+        vertical = (amplitude @ shift) * found.recording.voxel_mm
         # u belongs to the current height z: du/dz = e / (1 + e)
         slope = np.diff(vertical, axis=1) / np.diff(basis.height_mm[seen])
         folded = np.flatnonzero((slope >= 1).any(axis=1))
@@ -151,8 +155,8 @@ def _of_motion(found: Measurement, prior_voxel: float, number: NDArray[np.intp])
             figure=f"an amplitude is {moved:.3g} voxels rms, {moved / prior_voxel:.1f} times prior_voxel",
             advice="raise prior_voxel: it holds the motion back",
         )
-    shares = np.nanmean(found.data_share[:, seen], axis=(0, 1)) if seen.any() else np.ones(0)
-    believed = [name for name, share in zip(basis.motions, shares, strict=False) if share < FROM_DATA]
+    shares = np.nanmean(found.motion.data_share[:, seen], axis=(0, 1)) if seen.any() else np.ones(0)
+    believed = [name for name, share in zip(basis.names, shares, strict=False) if share < FROM_DATA]
     if believed:
         yield Doubt(
             name="prior-alone",
@@ -165,19 +169,20 @@ def _of_ends(found: Measurement, volume: Volume, geometry: ConeBeam) -> Iterator
     share = cut_rows(found, volume, geometry)
     over = np.flatnonzero(share > CUT_ROWS)
     if len(over):
-        rows = found.window[1] - found.window[0]
+        rows = found.recording.window[1] - found.recording.window[0]
         more = int(np.ceil(share.max() * rows)) + 1
         yield Doubt(
             name="cut-ends",
             figure=f"rays of up to {share.max():.0%} of the used rows leave the volume through its cut ends",
-            advice=f"leave out {more} rows more: discard_rows = {found.window[0] + more}",
+            advice=f"leave out {more} rows more: discard_rows = {found.recording.window[0] + more}",
             steps=tuple(over.tolist()),
         )
 
 
 def _of_window(found: Measurement, hull: Hull, geometry: ConeBeam) -> Iterator[Doubt]:
-    low, high = found.basis.height_mm[[0, -1]]
-    cut = max(found.window[2], geometry.columns - found.window[3]) - free_columns(geometry, hull, low, high)
+    low, high = found.motion.basis.height_mm[[0, -1]]
+    _, _, left, right = found.recording.window
+    cut = max(left, geometry.columns - right) - free_columns(geometry, hull, low, high)
     if cut > HULL_MARGIN_PX:
         yield Doubt(
             name="narrow-window",
@@ -190,21 +195,21 @@ def cut_rows(found: Measurement, volume: Volume, geometry: ConeBeam) -> Floats:
     """Return the share of used rows (step,) whose rays, moved back, leave the volume where it is cut in height."""
     radius = volume.hull.radius_mm()
     bottom, top = kept_heights_mm(volume.grid)
-    row = np.arange(found.window[0], found.window[1]) - (geometry.rows - 1) / 2
+    row = np.arange(found.recording.window[0], found.recording.window[1]) - (geometry.rows - 1) / 2
     rise = -(row * geometry.pixel_mm + geometry.row_shift_mm) / geometry.source_detector_mm
     reach = np.stack([rise * (geometry.source_axis_mm - radius), rise * (geometry.source_axis_mm + radius)])
     points = np.zeros((reach.size, 3))
     points[:, 2] = reach.ravel()
-    result = np.empty(len(found.amplitude))
-    for step, amplitude in enumerate(found.amplitude):
-        moved = found.basis.displacement(np.nan_to_num(amplitude), points)[:, 2] * found.voxel_mm
+    result = np.empty(len(found.motion.amplitude))
+    for step, amplitude in enumerate(found.motion.amplitude):
+        moved = found.motion.basis.displacement(np.nan_to_num(amplitude), points)[:, 2] * found.recording.voxel_mm
         was = reach - moved.reshape(reach.shape)
         result[step] = ((was < bottom) | (was > top)).any(axis=0).mean()
     return result
 
 
 def _of_convergence(found: Measurement) -> Iterator[Doubt]:
-    last = found.stages[-1]
+    last = found.fit.stages[-1]
     if last.stop is Stop.UNFINISHED and not last.last_change_voxel < STILL_MOVES_VOXEL:
         yield Doubt(
             name="not-converged",
@@ -214,8 +219,8 @@ def _of_convergence(found: Measurement) -> Iterator[Doubt]:
 
 
 def _of_basis(found: Measurement) -> Iterator[Doubt]:
-    functions, steps = found.time_functions.shape
-    alone = (np.count_nonzero(found.time_functions, axis=0) <= 1).all()
+    functions, steps = found.motion.time_functions.shape
+    alone = (np.count_nonzero(found.motion.time_functions, axis=0) <= 1).all()
     if steps < FEW_STEPS or (functions >= steps and not alone):
         yield Doubt(
             name="few-steps",
@@ -229,7 +234,7 @@ def _of_force(found: Measurement, hull: Hull) -> Iterator[Doubt]:
     half = filled.shape[1] // 2
     # of a square as wide as the hull where that is thinnest
     area = float((filled[:, :half] + filled[:, half:]).min() ** 2)
-    stress = float(np.abs(found.force_N).max()) / area
+    stress = float(np.abs(found.recording.force_N).max()) / area
     if stress > STRENGTH_MPA:
         yield Doubt(
             name="force",
@@ -240,13 +245,13 @@ def _of_force(found: Measurement, hull: Hull) -> Iterator[Doubt]:
 
 def check_finite(measurement: Measurement) -> None:
     """Raise ValueError where a number of a measurement is not finite that a reader would take for measured."""
-    seen = measurement.observed
+    seen = measurement.motion.observed
     numbers: dict[str, NDArray[np.floating]] = {
-        "displacements": measurement.amplitude[:, seen],
-        "standard deviations": measurement.amplitude_std[:, seen],
-        "covariances": measurement.covariance,
-        "residuals": measurement.residual_final,
-        "SNR": np.stack([measurement.snr_initial_db, measurement.snr_rigid_db, measurement.snr_final_db]),
+        "displacements": measurement.motion.amplitude[:, seen],
+        "standard deviations": measurement.motion.amplitude_std[:, seen],
+        "covariances": measurement.motion.covariance,
+        "residuals": measurement.fit.residual_final,
+        "SNR": np.stack([measurement.fit.snr_initial_db, measurement.fit.snr_rigid_db, measurement.fit.snr_final_db]),
     }
     wrong = [name for name, values in numbers.items() if not np.isfinite(values).all()]
     if wrong:

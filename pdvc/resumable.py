@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pdvc.lock import held
-from pdvc.measurement import Measurement, write_measurement
+from pdvc.measurement import Measurement
+from pdvc.measurement_file import write_measurement
 from pdvc.progress import Progress, silent
 
 if TYPE_CHECKING:

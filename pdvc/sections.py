@@ -10,6 +10,7 @@ whose rotations all turn about one point: hat functions reproduce what is linear
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,44 +18,99 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
-RIGID = ("translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z")
+Row = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SectionPattern:
+    """A motion that a section may make, by its unit amplitude: psi(x) = G (x - z_j e_z) / radius + t."""
+
+    name: str
+    """What options and results call it."""
+    gradient: tuple[Row, Row, Row] = ((0, 0, 0), (0, 0, 0), (0, 0, 0))
+    """G, without unit."""
+    shift: Row = (0, 0, 0)
+    """t, without unit."""
+
+    @classmethod
+    def of(cls, name: str, pattern: ArrayLike) -> SectionPattern:
+        """Return the motion with a pattern [G | t] (3, 4)."""
+        rows = [tuple(float(value) for value in row) for row in np.asarray(pattern)]
+        first, second, third = ((x, y, z) for x, y, z, _ in rows)
+        x, y, z = (row[3] for row in rows)
+        return cls(name=name, gradient=(first, second, third), shift=(x, y, z))
+
+    def pattern(self) -> Floats:
+        """Return [G | t] (3, 4)."""
+        return np.column_stack([np.array(self.gradient, dtype=float), np.array(self.shift, dtype=float)])
+
+
+TRANSLATION_X = SectionPattern(name="translation_x", shift=(1, 0, 0))
+TRANSLATION_Y = SectionPattern(name="translation_y", shift=(0, 1, 0))
+TRANSLATION_Z = SectionPattern(name="translation_z", shift=(0, 0, 1))
+ROTATION_X = SectionPattern(name="rotation_x", gradient=((0, 0, 0), (0, 0, -1), (0, 1, 0)))
+ROTATION_Y = SectionPattern(name="rotation_y", gradient=((0, 0, 1), (0, 0, 0), (-1, 0, 0)))
+ROTATION_Z = SectionPattern(name="rotation_z", gradient=((0, -1, 0), (1, 0, 0), (0, 0, 0)))
+RIGID = (TRANSLATION_X, TRANSLATION_Y, TRANSLATION_Z, ROTATION_X, ROTATION_Y, ROTATION_Z)
 """The paper's six motions of a section."""
-CONTRACTION = "contraction"
+CONTRACTION = SectionPattern(name="contraction", gradient=((1, 0, 0), (0, 1, 0), (0, 0, 0)))
 """One more: the section grows or shrinks alike in x and y, as plastic flow makes it."""
 
-_PATTERNS: dict[str, NDArray[np.float64]] = {
-    # each row: [G | t], so that psi = G (x - z_j e_z) / radius + t
-    "translation_x": np.array([[0, 0, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float),
-    "translation_y": np.array([[0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]], dtype=float),
-    "translation_z": np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]], dtype=float),
-    "rotation_x": np.array([[0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]], dtype=float),
-    "rotation_y": np.array([[0, 0, 1, 0], [0, 0, 0, 0], [-1, 0, 0, 0]], dtype=float),
-    "rotation_z": np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]], dtype=float),
-    "contraction": np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=float),
-}
+_OFFERED = {motion.name: motion for motion in (*RIGID, CONTRACTION)}
+
+
+def offer_motion(motion: SectionPattern) -> None:
+    """Offer a motion of one's own to the option `section_motions`, under its name.
+
+    Raises ValueError where another motion has that name.
+    """
+    if _OFFERED.setdefault(motion.name, motion) != motion:
+        raise ValueError(f"section motion {motion.name!r}: expected a name that is free, another motion has it")
+
+
+def names_of(motions: Iterable[SectionPattern]) -> tuple[str, ...]:
+    """Return the names of motions."""
+    return tuple(motion.name for motion in motions)
+
+
+def motions_named(names: Iterable[str]) -> tuple[SectionPattern, ...]:
+    """Return motions by their names; raises ValueError where one is not offered."""
+    wanted = tuple(names)
+    unknown = [name for name in wanted if name not in _OFFERED]
+    if unknown or not wanted:
+        raise ValueError(f"section motions: expected some of {sorted(_OFFERED)}, got {wanted}")
+    return tuple(_OFFERED[name] for name in wanted)
+
+
+NEARLY = 1e-9
+"""Share of a motion that may be missed where it counts as represented: what rounding leaves."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SectionBasis:
-    """Hold the heights of the sections and the motions that each may make."""
+    """Sections at some heights, and the motions that each may make."""
 
     height_mm: Floats
     """Heights z_j of the sections, mm, increasing; one alone makes the whole sample move as one."""
     radius_mm: float
     """Distance from the axis at which a unit rotation amplitude moves a point by a voxel."""
-    motions: tuple[str, ...] = RIGID
-    """Names of the motions of each section."""
+    motions: tuple[SectionPattern, ...] = RIGID
+    """The motions of each section, none of them a sum of others."""
 
     def __post_init__(self) -> None:
         height = np.asarray(self.height_mm, dtype=float)
         if height.ndim != 1 or len(height) < 1 or np.any(np.diff(height) <= 0):
             raise ValueError(f"section heights: expected increasing numbers in mm, got {self.height_mm}")
-        unknown = [name for name in self.motions if name not in _PATTERNS]
-        if unknown or not self.motions:
-            raise ValueError(f"section motions: expected some of {sorted(_PATTERNS)}, got {self.motions}")
+        if not self.motions or np.linalg.matrix_rank(self._patterns()) < len(self.motions):
+            raise ValueError(f"section motions: expected some, none a sum of others, got {self.names}")
         if not self.radius_mm > 0:
             raise ValueError(f"section radius: expected a positive length in mm, got {self.radius_mm}")
         object.__setattr__(self, "height_mm", height)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the motions."""
+        return names_of(self.motions)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -63,8 +119,7 @@ class SectionBasis:
 
     def patterns(self) -> Floats:
         """Return psi_jk as affine maps [G | t] of x in mm: (section, motion, 3, 4), unit amplitude."""
-        pattern = np.stack([_PATTERNS[name] for name in self.motions])
-        result = np.repeat(pattern[None], len(self.height_mm), axis=0)
+        result = np.repeat(self._patterns().reshape(1, -1, 3, 4), len(self.height_mm), axis=0)
         result[..., :3] /= self.radius_mm
         result[..., 3] -= result[..., 2] * self.height_mm[:, None, None]
         return result
@@ -103,23 +158,36 @@ class SectionBasis:
         maps[(weights[:, np.isnan(affine).any(axis=(1, 2))] > 0).any(axis=1)] = np.nan
         return np.einsum("pab,pb->pa", maps[..., :3], points) + maps[..., 3]
 
-    def rigid(self, amplitude: ArrayLike, single: SectionBasis) -> Floats:
+    def reproduced(self, amplitude: ArrayLike, single: SectionBasis) -> Floats:
         """Return the amplitudes of this basis that reproduce a motion of `single`, a basis of one section.
 
         `amplitude` (..., 1, motion of single) in voxels; returns (..., section, motion). Exact, because hat
-        functions reproduce linear fields.
+        functions reproduce linear fields. Raises ValueError where the sections cannot move so.
         """
         moved = single.affine(amplitude)[..., 0, :, :]
-        result = np.zeros((*moved.shape[:-2], *self.shape))
-        at_axis = moved[..., None, :, 3] + moved[..., None, :, 2] * self.height_mm[:, None]
-        gradient = moved[..., :3] * self.radius_mm
-        for k, name in enumerate(self.motions):
-            kind, _, axis = name.partition("_")
-            if kind == "translation":
-                result[..., k] = at_axis[..., "xyz".index(axis)]
-            elif kind == "rotation":
-                row, column = {"x": (2, 1), "y": (0, 2), "z": (1, 0)}[axis]
-                result[..., k] = gradient[..., row, column][..., None]
-            else:
-                result[..., k] = gradient[..., 0, 0][..., None]
-        return result
+        wanted = np.zeros((*moved.shape[:-2], len(self.height_mm), 3, 4))
+        # each section has its own origin on the axis, and its rotations are displacements at the radius
+        wanted[..., :3] = moved[..., None, :, :3] * self.radius_mm
+        wanted[..., 3] = moved[..., None, :, 3] + moved[..., None, :, 2] * self.height_mm[:, None]
+        flat, patterns = wanted.reshape(*wanted.shape[:-2], 12), self._patterns()
+        # the least-squares answer by its normal equations: without rounding for patterns that share no entry
+        found = np.linalg.solve(patterns @ patterns.T, (flat @ patterns.T)[..., None])[..., 0]
+        missed = np.abs(found @ patterns - flat).max(initial=0.0)
+        if missed > NEARLY * max(np.abs(flat).max(initial=0.0), 1.0):
+            raise ValueError(
+                f"section motions: expected motions that can follow the sample as one rigid body, but {self.names} "
+                f"miss up to {missed:.2g} voxel of what {single.names} make"
+            )
+        return np.asarray(found)
+
+    def reproduces(self, single: SectionBasis) -> bool:
+        """Return whether these sections can follow every motion of `single`, a basis of one section."""
+        try:
+            self.reproduced(np.eye(len(single.motions))[:, None], single)
+        except ValueError:
+            return False
+        return True
+
+    def _patterns(self) -> Floats:
+        """Return [G | t] of each motion, flat (motion, 12)."""
+        return np.stack([motion.pattern().ravel() for motion in self.motions])

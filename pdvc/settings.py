@@ -7,22 +7,22 @@ import math
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import tomlkit
-from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticKnownError, core_schema
 
 LARGEST = 1e15
 """Size that no number of a record exceeds, whatever its unit: squares and products of such numbers are finite."""
 
 
 class SettingsError(ValueError):
-    """Say which key of which file is wrong, what was expected there and what was given."""
+    """A key of a file is wrong: which, what was expected there and what was given."""
 
 
 class Settings(BaseModel):
-    """Be the base of every record that a user writes: unknown keys and wrong types are refused.
+    """A record that a user writes: unknown keys and wrong types are refused.
 
     Fields carry their unit in the name (``_mm``, ``_s``, ``_N``, ``_deg``) and a one-line description,
     which `template` prints as a comment.
@@ -61,6 +61,65 @@ class Settings(BaseModel):
         document = tomlkit.document()
         _fill(document, self)
         return tomlkit.dumps(document)
+
+
+class Choice(Settings):
+    """A record that TOML chooses among others of its family by its `kind`.
+
+    A family is a direct subclass; its own subclasses are its kinds, offered to TOML as soon as they are defined. A
+    field of the family's type takes any of them.
+    """
+
+    kind: str
+
+    _kinds: ClassVar[dict[str, type[Choice]]]
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        if cls._is_family():
+            cls._kinds = {}
+            return
+        kind = cls.model_fields["kind"].default
+        known = cls._kinds.setdefault(kind, cls)
+        # the same one again is a notebook's cell, or a module, that was run twice
+        if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise TypeError(f"kind {kind!r}: expected one record of this kind, found {known} and {cls}")
+        cls._kinds[kind] = cls
+
+    @classmethod
+    def kinds(cls) -> tuple[type[Self], ...]:
+        """Return the records of this family that are offered, in the order in which they were defined."""
+        return tuple(cls._kinds.values())  # type: ignore[arg-type]  # a family holds its own
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        if not cls._is_family():
+            return handler(source)
+        return core_schema.no_info_plain_validator_function(
+            cls._chosen, serialization=core_schema.plain_serializer_function_ser_schema(BaseModel.model_dump)
+        )
+
+    @classmethod
+    def _is_family(cls) -> bool:
+        """Return whether this is a direct subclass of Choice; Choice itself is asked before it has a name."""
+        return cls.__mro__.index(Settings) == 2
+
+    @classmethod
+    def _chosen(cls, value: Any) -> Self:
+        if isinstance(value, cls):
+            return value
+        if not isinstance(value, dict):
+            kinds = " or ".join(repr(name) for name in cls._kinds)
+            raise PydanticCustomError("choice", "a table with the kind {kinds}", {"kinds": kinds})
+        if "kind" not in value:
+            raise PydanticKnownError("union_tag_not_found", {"discriminator": "'kind'"})
+        kind = cls._kinds.get(str(value["kind"]))
+        if kind is None:
+            expected = ", ".join(repr(name) for name in cls._kinds)
+            context = {"discriminator": "'kind'", "tag": str(value["kind"]), "expected_tags": expected}
+            raise PydanticKnownError("union_tag_invalid", context)
+        # strict validation takes a list for a tuple only from JSON
+        return kind.model_validate_json(json.dumps(value))  # type: ignore[return-value]
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a solver returns, and the careful step that solvers share."""
+"""What a solver is asked and returns, and the careful step that solvers share."""
 
 from __future__ import annotations
 
@@ -10,14 +10,42 @@ from numpy.typing import NDArray
 
 from pdvc.equations import Equations, Linearise
 from pdvc.prior import Prior
+from pdvc.settings import Choice
 from pdvc.verdict import Stop
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
+class Problem:
+    """A motion to be found in radiographs of one scale."""
+
+    linearise: Linearise
+    time_functions: Floats
+    """Orthonormal (function, step)."""
+    start: Floats
+    """Amplitudes (function, section, motion) to start from, voxels."""
+    prior: Prior
+    noise_rms: float | None
+    """gamma_f, the rms noise of the radiographs, grey levels; None where it is unknown or says nothing yet."""
+
+
+class Solver(Choice):
+    """A way to solve a stage, with how far it goes; TOML finds a further kind as soon as it is defined."""
+
+    def solve(self, problem: Problem) -> Solution:
+        """Return the motion that solves a problem, or comes as near as the solver goes."""
+        raise NotImplementedError
+
+    @property
+    def passes(self) -> float:
+        """Return about how many passes over all radiographs it may take."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
 class Solution:
-    """Hold what a solver found: the motion, how it got there, and why it stopped."""
+    """What a solver found: the motion, how it got there, and why it stopped."""
 
     coefficients: Floats
     """u_ij: amplitudes (function, section, motion), voxels, the start included."""

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.deviations import step_covariance
 from pdvc.equations import Equations
 from pdvc.gauss_newton import hessian
-from pdvc.measurement import step_covariance
 from pdvc.noise import separate
 from pdvc.prior import LEAST_RMS, Prior, solved
 

@@ -24,7 +24,7 @@ errors are not quite independent.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -38,24 +38,22 @@ from pdvc.compilation import compile_comparison, compile_kernels
 from pdvc.data_checks import doubts_of_reference, usable
 from pdvc.equations import Equations
 from pdvc.experiment import Experiment, InterruptedScan
-from pdvc.geometry import ConeBeam
 from pdvc.history import Steps, time_basis
 from pdvc.measure import versions
-from pdvc.measurement import Measurement, Stage
-from pdvc.options import MeasureOptions, coarse_scale, resolved
-from pdvc.preparation import bases, calibrated, outlined, reference_volume, scan_volume
+from pdvc.measurement import MeasuredMotion, Measurement, Provenance, Stage, unfitted
+from pdvc.options import MeasureOptions, coarse_scale
+from pdvc.preparation import reference_volume, scan_volume
 from pdvc.prior import LEAST_RMS, Prior
 from pdvc.progress import Progress, silent
-from pdvc.radiographs import IDENTITY, Calibration, snr_db
+from pdvc.radiographs import IDENTITY, snr_db
 from pdvc.result_checks import doubts_of_solution
 from pdvc.sections import SectionBasis
+from pdvc.setup import Setup, outlined, set_up
 from pdvc.solution import Solution
-from pdvc.store import Store
 from pdvc.uncertainty import UNSEEN, sandwich
 from pdvc.verdict import Stop, Verdict
 from pdvc.volume import Volume, halved, smoothed
 from pdvc.volume_equations import Comparison, VolumePair, compare, used_voxels
-from pdvc.window import used_window
 
 __all__ = ["MeasureOptions", "correlate"]
 
@@ -91,31 +89,21 @@ def correlate(
     compile_comparison()
     started = time.perf_counter()
     # volumes are filtered here, not the radiographs
-    options = resolved(options, experiment.geometry).model_copy(update={"smooth_px": 0.0})
     examined = usable(experiment, progress=progress)
-    store = Store(work, experiment)
-    calibration, outline = calibrated(experiment, options, store, progress)
-    window = used_window(experiment.geometry, options, outline.hull)
-    rigid, sections = bases(experiment.geometry, window, outline.hull, options)
-    bench = _Bench(
-        geometry=experiment.geometry,
-        calibration=calibration,
-        options=options,
-        bases={"rigid": rigid, "deformation": sections},
-        store=store,
-    )
+    options = options.model_copy(update={"smooth_px": 0.0})
+    setup = set_up(experiment, options, work=work, progress=progress)
+    stages = _stages_of(setup)
 
     def reference(scale: int) -> Volume:
-        volume = reference_volume(experiment, calibration, outline.hull, scale, options, store, progress)
-        return halved(smoothed(volume, SMOOTHING_VOXEL))
+        return halved(smoothed(reference_volume(setup, scale, progress), SMOOTHING_VOXEL))
 
-    references = {scale: reference(scale) for scale in bench.scales}
+    references = {scale: reference(scale) for scale in dict.fromkeys(stage.scale for stage in stages)}
     prepared = time.perf_counter()
     found = {
-        scan.step: store.arrays(
+        scan.step: setup.store.arrays(
             "correlation",
-            (scan.step, options),
-            lambda scan=scan: _correlated(bench, references, scan, progress),  # type: ignore[misc]
+            (scan.step, setup.options),
+            lambda scan=scan: _correlated(setup, references, scan, progress),  # type: ignore[misc]
         )
         for scan in experiment.interrupted
     }
@@ -131,97 +119,88 @@ def correlate(
         return result
 
     reconstructing, measuring = np.sum([each["seconds"] for each in found.values()], axis=0)
-    nothing = np.zeros((len(experiment.test), 0, 0), dtype=np.float32)
     measured = Measurement(
-        title=experiment.title,
-        voxel_mm=experiment.geometry.voxel_mm,
-        source_axis_mm=experiment.geometry.source_axis_mm,
-        angle_rad=experiment.test.angle_rad,
-        time_s=experiment.test.time_s,
-        force_N=experiment.test.force_N,
-        window=window,
-        basis=sections,
-        time_functions=time_basis((Steps(),), experiment.test)[steps],
-        amplitude=np.where(observed[:, None], at_steps("amplitude"), np.nan),
-        # coefficients multiply a function that is sqrt(steps) at its scan
-        covariance=np.stack([each["covariance"] for each in found.values()]) / len(experiment.test),
-        amplitude_std=np.where(observed[:, None], at_steps("deviation"), np.nan),
-        data_share=np.where(observed[:, None], at_steps("data_share"), 0.0),
-        observed=observed,
-        stages=_stages(bench, found, len(experiment.test)),
-        snr_reprojection_db=np.empty(0),
-        snr_initial_db=at_steps("snr_initial"),
-        snr_rigid_db=at_steps("snr_rigid"),
-        snr_final_db=at_steps("snr_final"),
-        snr_noise_db=np.full(len(experiment.test), np.nan),
-        residual_initial=nothing,
-        residual_rigid=nothing,
-        residual_final=nothing,
-        seconds={
-            "compile": started - compiling,
-            "reconstruct": prepared - started + float(reconstructing),
-            "measure": float(measuring),
-        },
-        options=options.template(),
-        versions=versions(),
+        recording=setup.recording(),
+        motion=MeasuredMotion(
+            basis=setup.sections,
+            time_functions=time_basis((Steps(),), experiment.test)[steps],
+            amplitude=np.where(observed[:, None], at_steps("amplitude"), np.nan),
+            # coefficients multiply a function that is sqrt(steps) at its scan
+            covariance=np.stack([each["covariance"] for each in found.values()]) / len(experiment.test),
+            amplitude_std=np.where(observed[:, None], at_steps("deviation"), np.nan),
+            data_share=np.where(observed[:, None], at_steps("data_share"), 0.0),
+            observed=observed,
+        ),
+        fit=replace(
+            unfitted(_records(stages, found, len(experiment.test)), len(experiment.test)),
+            snr_initial_db=at_steps("snr_initial"),
+            snr_rigid_db=at_steps("snr_rigid"),
+            snr_final_db=at_steps("snr_final"),
+        ),
+        provenance=Provenance(
+            seconds={
+                "compile": started - compiling,
+                "reconstruct": prepared - started + float(reconstructing),
+                "measure": float(measuring),
+            },
+            options=setup.options.template(),
+            versions=versions(),
+        ),
     )
     doubts = (*doubts_of_reference(examined, experiment), *doubts_of_solution(measured, options.prior_voxel))
     return replace(measured, verdict=Verdict(doubts=doubts))
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Bench:
-    """Hold what all scans have in common."""
+class _Stage:
+    """A stage of the correlation of a scan."""
 
-    geometry: ConeBeam
-    calibration: Calibration
-    options: MeasureOptions
-    bases: Mapping[str, SectionBasis]
-    """By the name of the stage: ``rigid``, ``deformation``."""
-    store: Store
+    name: str
+    """``rigid`` or ``deformation``."""
+    scale: int
+    basis: SectionBasis
 
-    @property
-    def stages(self) -> tuple[tuple[str, int], ...]:
-        """Return name and scale of the stages, in the order carried out."""
-        coarse = coarse_scale(self.geometry)
-        finer = (coarse >> n for n in range(coarse.bit_length()))
-        return (("rigid", coarse), *(("deformation", scale) for scale in finer))
 
-    @property
-    def scales(self) -> tuple[int, ...]:
-        """Return the scales of the stages, coarsest first."""
-        return tuple(dict.fromkeys(scale for _, scale in self.stages))
+def _stages_of(setup: Setup) -> tuple[_Stage, ...]:
+    """Return the stages in the order carried out: rigid at the coarse scale, then sections down to scale 1."""
+    coarse = coarse_scale(setup.geometry)
+    finer = (coarse >> n for n in range(coarse.bit_length()))
+    return (
+        _Stage(name="rigid", scale=coarse, basis=setup.rigid),
+        *(_Stage(name="deformation", scale=scale, basis=setup.sections) for scale in finer),
+    )
 
-    def pairs(
-        self, references: Mapping[int, Volume], scan: InterruptedScan, progress: Progress
-    ) -> dict[int, VolumePair]:
-        """Reconstruct an interrupted scan, inside the hull that its own views show, to be compared."""
-        series, calibration = scan.series, self.calibration
-        outline = outlined(
-            series,
-            self.geometry,
-            calibration.with_polynomial(IDENTITY),
-            calibration.polynomial,
-            partial(self.store.arrays, "outline", (scan.step, calibration)),
-            progress,
+
+def _pairs(
+    setup: Setup, references: Mapping[int, Volume], scan: InterruptedScan, progress: Progress
+) -> dict[int, VolumePair]:
+    """Reconstruct an interrupted scan, inside the hull that its own views show, to be compared at each scale."""
+    series, calibration = scan.series, setup.calibration
+    outline = outlined(
+        series,
+        setup.geometry,
+        calibration.with_polynomial(IDENTITY),
+        calibration.polynomial,
+        partial(setup.store.arrays, "outline", (scan.step, calibration)),
+        progress,
+    )
+    low, high = setup.sections.height_mm[[0, -1]]
+
+    def pair(scale: int) -> VolumePair:
+        keep = partial(setup.store.arrays, "volume", (scan.step, scale, calibration, outline.hull))
+        volume = scan_volume(series, setup.geometry, calibration, outline.hull, scale, 0.0, keep, progress)
+        return VolumePair(
+            reference=references[scale],
+            deformed=smoothed(volume, SMOOTHING_VOXEL),
+            used=used_voxels(volume.grid, outline.hull, float(low), float(high)),
+            voxel_mm=setup.geometry.voxel_mm,
         )
-        low, high = self.bases["deformation"].height_mm[[0, -1]]
 
-        def pair(scale: int) -> VolumePair:
-            keep = partial(self.store.arrays, "volume", (scan.step, scale, calibration, outline.hull))
-            volume = scan_volume(series, self.geometry, calibration, outline.hull, scale, 0.0, keep, progress)
-            return VolumePair(
-                reference=references[scale],
-                deformed=smoothed(volume, SMOOTHING_VOXEL),
-                used=used_voxels(volume.grid, outline.hull, float(low), float(high)),
-                voxel_mm=self.geometry.voxel_mm,
-            )
-
-        return {scale: pair(scale) for scale in self.scales}
+    return {scale: pair(scale) for scale in references}
 
 
 def _correlated(
-    bench: _Bench, references: Mapping[int, Volume], scan: InterruptedScan, progress: Progress
+    setup: Setup, references: Mapping[int, Volume], scan: InterruptedScan, progress: Progress
 ) -> dict[str, NDArray[Any]]:
     """Measure one scan: the amplitudes and all that is told of them, as arrays."""
 
@@ -230,19 +209,19 @@ def _correlated(
 
     started = time.perf_counter()
     try:
-        pairs = bench.pairs(references, scan, named)
+        pairs = _pairs(setup, references, scan, named)
     except ValueError as error:
         raise ValueError(f"interrupted scan at step {scan.step}: {error}") from None
     solving = time.perf_counter()
+    basis, prior = setup.sections, setup.prior(setup.sections)
     solutions: list[Solution] = []
-    amplitude = np.zeros(bench.bases["rigid"].shape)
-    for name, scale in bench.stages:
-        basis = bench.bases[name]
+    amplitude = np.zeros(setup.rigid.shape)
+    for stage in _stages_of(setup):
         if len(solutions) == 1:
-            rigid = amplitude
-            amplitude = basis.rigid(rigid, bench.bases["rigid"])
-        prior = _prior(basis, bench.options)
-        solutions.append(_solved(pairs[scale], basis, amplitude, prior, f"{name}, scale {scale}", named))
+            amplitude = rigid = basis.reproduced(amplitude, setup.rigid)
+        task = f"{stage.name}, scale {stage.scale}"
+        believed = setup.prior(stage.basis)
+        solutions.append(_solved(pairs[stage.scale], stage.basis, amplitude, believed, task, named))
         amplitude = solutions[-1].coefficients[0]
     fine = pairs[1]
     last = compare(fine, basis, amplitude)
@@ -250,7 +229,7 @@ def _correlated(
     information = np.diag(last.equations().matrix[0]).reshape(basis.shape).sum(axis=1)
     deviation = np.sqrt(np.diag(covariance)).reshape(basis.shape)
     before = compare(fine, basis, np.zeros(basis.shape))
-    moved = compare(fine, basis, basis.rigid(rigid, bench.bases["rigid"]))
+    moved = compare(fine, basis, rigid)
     return {
         "amplitude": amplitude,
         "covariance": covariance,
@@ -290,10 +269,6 @@ def _solved(
     )
 
 
-def _prior(basis: SectionBasis, options: MeasureOptions) -> Prior:
-    return Prior(deviation_voxel=np.full(basis.shape, options.prior_voxel))
-
-
 def _covariance(comparison: Comparison, prior: Prior) -> Floats:
     """Return the covariance (section * motion, the same), voxel^2, of the amplitudes at a comparison."""
     equations = comparison.equations()
@@ -301,18 +276,20 @@ def _covariance(comparison: Comparison, prior: Prior) -> Floats:
     return sandwich(equations.matrix[0], comparison.vector_covariance(), prior.ridge(equations.rms), gamma2)
 
 
-def _stages(bench: _Bench, found: Mapping[int, Mapping[str, NDArray[Any]]], steps: int) -> tuple[Stage, ...]:
+def _records(
+    stages: Sequence[_Stage], found: Mapping[int, Mapping[str, NDArray[Any]]], steps: int
+) -> tuple[Stage, ...]:
     """Return the record of each stage, all scans together."""
     scans = list(found.values())
     result = []
-    for n, (name, scale) in enumerate(bench.stages):
-        shape = bench.bases[name].shape
+    for n, stage in enumerate(stages):
+        shape = stage.basis.shape
         squares = sum(scan["voxels"][n] * scan["rms"][n] ** 2 for scan in scans)
         unfinished = any(scan["stops"][n] == Stop.UNFINISHED for scan in scans)
         result.append(
             Stage(
-                name=name,
-                scale=scale,
+                name=stage.name,
+                scale=stage.scale,
                 solver=SOLVER,
                 unknowns=len(scans) * shape[0] * shape[1],
                 temporal=np.empty((0, steps)),

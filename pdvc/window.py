@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.geometry import ConeBeam
-from pdvc.options import MeasureOptions
 from pdvc.reconstruction import seen_half_height_mm
 from pdvc.volume import Grid, Hull
 
@@ -16,14 +15,14 @@ USUAL_ROWS, USUAL_COLUMNS = 100 / 954, 60 / 432
 """Shares of the rows and columns that are left out on each side, as in the paper."""
 
 
-def used_window(geometry: ConeBeam, options: MeasureOptions, hull: Hull) -> tuple[int, int, int, int]:
+def used_window(geometry: ConeBeam, hull: Hull, rows: int | None, columns: int | None) -> tuple[int, int, int, int]:
     """Return the used rows and columns: row_from, row_to, column_from, column_to.
 
-    What the options leave open is the paper's share of the detector, but for two things that the sample asks for:
-    rows whose rays would leave the volume through its cut ends are left out, and columns that see the sample are not.
+    `rows` and `columns` are left out on each side. What is left open is the paper's share of the detector, but for two
+    things that the sample asks for: rows whose rays would leave the volume through its cut ends are left out, and
+    columns that see the sample are not.
     Raises ValueError where no rows would be left.
     """
-    rows, columns = options.discard_rows, options.discard_columns
     if rows is None:
         reached = reached_rows(geometry, scan_grid(geometry, hull), hull)
         rows = max(round(geometry.rows * USUAL_ROWS), reached.start, geometry.rows - reached.stop)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pdvc.measurement import Measurement, Stage
+from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Recording, Stage
 from pdvc.sections import SectionBasis
 from pdvc.verdict import Stop
 
@@ -94,39 +94,57 @@ def measurement(amplitude: Floats, *, unobserved: tuple[int, ...] = (), title: s
 
     functions = np.sqrt(steps) * np.linalg.qr(rng.normal(size=(steps, 7)))[0].T
     return Measurement(
-        title=title,
-        voxel_mm=VOXEL_MM,
-        source_axis_mm=28.57,
-        angle_rad=angles(steps),
-        time_s=2.0 * np.arange(steps),
-        force_N=250 + 500 * np.clip(np.arange(steps) / (steps - 1) * 2 - 1, 0, None),
-        window=(10, 70, 6, 34),
-        basis=SectionBasis(height_mm=HEIGHT_MM[:sections], radius_mm=0.6),
-        time_functions=functions,
-        amplitude=amplitude,
-        amplitude_std=np.full_like(amplitude, 0.02),
-        covariance=4e-4 / steps * np.eye(len(functions) * sections * motions),
-        data_share=np.broadcast_to(np.linspace(0.2, 1, motions), amplitude.shape).copy(),
-        observed=observed,
-        stages=(stage("rigid", 5, 1), stage("deformation", 3, sections)),
-        snr_reprojection_db=21 + rng.normal(0, 0.2, 40),
-        snr_initial_db=10 + 3 * np.cos(np.arange(steps)),
-        snr_rigid_db=25 - np.linspace(0, 3, steps),
-        snr_final_db=27 + rng.normal(0, 0.2, steps),
-        snr_noise_db=np.full(steps, 27.6),
-        residual_initial=residual(0.2),
-        residual_rigid=residual(0.02),
-        residual_final=residual(0.002),
-        seconds={"reconstruct": 12.5, "measure": 60.25},
-        options="scale = 2\n",
-        versions="pdvc-bench 0.1.0, numpy 2",
+        recording=Recording(
+            title=title,
+            voxel_mm=VOXEL_MM,
+            source_axis_mm=28.57,
+            angle_rad=angles(steps),
+            time_s=2.0 * np.arange(steps),
+            force_N=250 + 500 * np.clip(np.arange(steps) / (steps - 1) * 2 - 1, 0, None),
+            window=(10, 70, 6, 34),
+        ),
+        motion=MeasuredMotion(
+            basis=SectionBasis(height_mm=HEIGHT_MM[:sections], radius_mm=0.6),
+            time_functions=functions,
+            amplitude=amplitude,
+            amplitude_std=np.full_like(amplitude, 0.02),
+            covariance=4e-4 / steps * np.eye(len(functions) * sections * motions),
+            data_share=np.broadcast_to(np.linspace(0.2, 1, motions), amplitude.shape).copy(),
+            observed=observed,
+        ),
+        fit=Fit(
+            stages=(stage("rigid", 5, 1), stage("deformation", 3, sections)),
+            snr_reprojection_db=21 + rng.normal(0, 0.2, 40),
+            snr_initial_db=10 + 3 * np.cos(np.arange(steps)),
+            snr_rigid_db=25 - np.linspace(0, 3, steps),
+            snr_final_db=27 + rng.normal(0, 0.2, steps),
+            snr_noise_db=np.full(steps, 27.6),
+            residual_initial=residual(0.2),
+            residual_rigid=residual(0.02),
+            residual_final=residual(0.002),
+        ),
+        provenance=Provenance(
+            seconds={"reconstruct": 12.5, "measure": 60.25},
+            options="scale = 2\n",
+            versions="pdvc-bench 0.1.0, numpy 2",
+        ),
     )
+
+
+def altered(measurement: Measurement, **fields: object) -> Measurement:
+    """Return the measurement with other values in some fields, of whichever part of the record."""
+    changes: dict[str, object] = {}
+    for name in ("recording", "motion", "fit", "provenance"):
+        part = getattr(measurement, name)
+        own = {key: fields.pop(key) for key in tuple(fields) if hasattr(part, key)}
+        changes[name] = replace(part, **own)
+    return replace(measurement, **changes, **fields)
 
 
 def drawn(measurement: Measurement, rng: np.random.Generator) -> Measurement:
     """Return the measurement with an error of the covariance that it claims."""
-    error = np.linalg.cholesky(measurement.covariance) @ rng.normal(size=len(measurement.covariance))
-    error = error.reshape(-1, *measurement.amplitude.shape[1:])
-    return replace(
-        measurement, amplitude=measurement.amplitude + np.einsum("ft,fjk->tjk", measurement.time_functions, error)
-    )
+    motion = measurement.motion
+    error = np.linalg.cholesky(motion.covariance) @ rng.normal(size=len(motion.covariance))
+    error = error.reshape(-1, *motion.amplitude.shape[1:])
+    moved = motion.amplitude + np.einsum("ft,fjk->tjk", motion.time_functions, error)
+    return altered(measurement, amplitude=moved)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -21,7 +19,7 @@ def test_at_a_section_only_that_section_takes_part(case):
     measurement, _ = case
     centre = centre_line_deviation(measurement)
     # white covariance of the coefficients: a step's variance is that times the squares of its functions
-    expected = np.sqrt(4e-4 / records.STEPS * (measurement.time_functions**2).sum(axis=0))
+    expected = np.sqrt(4e-4 / records.STEPS * (measurement.motion.time_functions**2).sum(axis=0))
     np.testing.assert_allclose(centre.std, np.broadcast_to(expected[:, None, None], centre.std.shape))
     length = np.diff(records.HEIGHT_MM) / records.VOXEL_MM
     np.testing.assert_allclose(centre.strain_std, np.sqrt(2) * expected[:, None] / length)
@@ -31,10 +29,10 @@ def test_at_a_section_only_that_section_takes_part(case):
 
 def test_an_error_turns_with_the_beam(case):
     measurement, truth = case
-    wrong = measurement.amplitude.copy()
+    wrong = measurement.motion.amplitude.copy()
     wrong[..., 0] += 0.3
-    centre = centre_line_deviation(replace(measurement, amplitude=wrong), truth)
-    turn = measurement.angle_rad[:, None] + np.zeros(len(centre.level_mm))
+    centre = centre_line_deviation(records.altered(measurement, amplitude=wrong), truth)
+    turn = measurement.recording.angle_rad[:, None] + np.zeros(len(centre.level_mm))
     seen = np.isfinite(centre.error[..., 0])
     np.testing.assert_allclose(centre.error[..., 0][seen], -0.3 * np.sin(turn)[seen], atol=1e-9)
     np.testing.assert_allclose(centre.error[..., 1][seen], 0, atol=1e-9)

@@ -30,7 +30,7 @@ class Moved:
 def known_motion(rng: np.random.Generator) -> Measurement:
     """Return a measurement that is exactly right, with a covariance that joins everything."""
     record = records.measurement(np.zeros((records.STEPS, SECTIONS, MOTIONS)))
-    functions = record.time_functions[:FUNCTIONS]
+    functions = record.motion.time_functions[:FUNCTIONS]
     coefficients = rng.normal(size=(FUNCTIONS, SECTIONS, MOTIONS))
     size = FUNCTIONS * SECTIONS * MOTIONS
     root = 0.02 * rng.normal(size=(size, size)) / np.sqrt(size) + 0.01 * np.eye(size)
@@ -45,23 +45,25 @@ def known_motion(rng: np.random.Generator) -> Measurement:
 
 def truth_of(measurement: Measurement) -> Moved:
     """Return material points that move as measured: U(X) = u(X + U), by iteration."""
-    low, high = measurement.basis.height_mm[[0, -1]]
+    low, high = measurement.motion.basis.height_mm[[0, -1]]
     level = np.linspace(low + 0.1, high - 0.1, 12)
     place = np.array([[0, 0], [-0.3, -0.2], [0.3, -0.2], [0.3, 0.2], [-0.3, 0.2]])
     points = np.array([[x, y, z] for z in level for x, y in place])
-    moved = np.zeros((len(measurement.angle_rad), *points.shape))
+    moved = np.zeros((len(measurement.recording.angle_rad), *points.shape))
     for step in range(len(moved)):
         for _ in range(40):
-            moved[step] = measurement.displacement(step, points + moved[step]) * measurement.voxel_mm
+            moved[step] = measurement.motion.displacement(step, points + moved[step]) * measurement.recording.voxel_mm
     return Moved(points, moved)
 
 
 def test_coefficients_of_a_motion_inside_the_span_are_found_exactly():
     exact = known_motion(np.random.default_rng(1))
-    found, missed = true_coefficients(exact.basis, exact.time_functions, exact.voxel_mm, truth_of(exact))
-    norm = (exact.time_functions**2).sum(axis=1)[:, None, None]
+    found, missed = true_coefficients(
+        exact.motion.basis, exact.motion.time_functions, exact.recording.voxel_mm, truth_of(exact)
+    )
+    norm = (exact.motion.time_functions**2).sum(axis=1)[:, None, None]
     np.testing.assert_allclose(
-        found, np.einsum("ft,tjk->fjk", exact.time_functions, exact.amplitude) / norm, atol=1e-6
+        found, np.einsum("ft,tjk->fjk", exact.motion.time_functions, exact.motion.amplitude) / norm, atol=1e-6
     )
     assert missed.max() < 1e-6
 
@@ -71,9 +73,9 @@ def test_a_motion_outside_the_span_is_told_by_how_much_it_is_missed():
     truth = truth_of(exact)
     # a wave in time that three smooth functions do not hold
     wave = 0.3 * (-1.0) ** np.arange(len(truth.displacement_mm))
-    truth.displacement_mm[..., 2] += wave[:, None] * exact.voxel_mm
-    _, missed = true_coefficients(exact.basis, exact.time_functions, exact.voxel_mm, truth)
-    held = np.linalg.norm(exact.time_functions @ wave) / np.sqrt(len(wave)) / np.linalg.norm(wave)
+    truth.displacement_mm[..., 2] += wave[:, None] * exact.recording.voxel_mm
+    _, missed = true_coefficients(exact.motion.basis, exact.motion.time_functions, exact.recording.voxel_mm, truth)
+    held = np.linalg.norm(exact.motion.time_functions @ wave) / np.sqrt(len(wave)) / np.linalg.norm(wave)
     assert 0.3 * np.sqrt(1 - held**2) * 0.95 < missed[2] < 0.3
 
 
@@ -100,7 +102,7 @@ def test_an_interval_half_as_wide_as_due_shows():
     rng = np.random.default_rng(8)
     exact = known_motion(rng)
     truth = truth_of(exact)
-    bold = [replace(records.drawn(exact, rng), covariance=exact.covariance / 4) for _ in range(20)]
+    bold = [records.altered(records.drawn(exact, rng), covariance=exact.motion.covariance / 4) for _ in range(20)]
     found = [interval_calibration(one, truth, point_errors(one, truth).components) for one in bold]
     assert np.sqrt(np.mean([one.z_rms.vertical**2 for one in found])) == pytest.approx(2, rel=0.2)
     assert np.mean([one.coverage_95.vertical for one in found]) < 0.8
@@ -114,7 +116,7 @@ def test_no_standard_deviation_that_is_predicted_is_below_the_bound(tmp_path):
     bound, truth = bound_of(one.scenario, one.options, clean)
     simulate(one.scenario, tmp_path / "experiment", clean=clean)
     measured = measure(read_experiment(tmp_path / "experiment"), one.options)
-    np.testing.assert_allclose(measured.basis.height_mm, bound.basis.height_mm, rtol=1e-6)
+    np.testing.assert_allclose(measured.motion.basis.height_mm, bound.basis.height_mm, rtol=1e-6)
     predicted = interval_calibration(measured, truth, point_errors(measured, truth).components).predicted
     least = bound.quantities(truth)
     for name in ("across_beam", "vertical", "strain"):

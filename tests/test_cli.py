@@ -8,7 +8,7 @@ import tomllib
 import pytest
 from rich.console import Console
 
-from pdvc.measurement import write_measurement
+from pdvc.measurement_file import write_measurement
 from tests import synthetic_records as records
 from tests.command_line import only_line, pdvc_bench
 from validation.console import ProgressBars, one_line_errors

@@ -214,14 +214,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pdvc.options import MeasureOptions, StageOptions
+from pdvc.gauss_newton import GaussNewton
 from pdvc.measure import measure
-from validation.methods.registry import looks_at_volumes
+from pdvc.options import MeasureOptions, StageOptions
+from validation.methods.registry import Method
 
 OPTIONS = MeasureOptions(
     sections=4,
-    rigid=(StageOptions(scale="coarse", solver="gauss-newton", most=4),),
-    deformation=(StageOptions(scale=1, solver="gauss-newton", most=2),),
+    rigid=(StageOptions(scale="coarse", solver=GaussNewton(most_passes=4)),),
+    deformation=(StageOptions(scale=1, solver=GaussNewton(most_passes=2)),),
 )
 
 
@@ -233,34 +234,32 @@ def note(method, experiment):
 
 
 def every(experiment):
-    """Assume that four sections will do.
-
-    This is not told.
-    """
     note("every", experiment)
     return measure(experiment, OPTIONS)
 
 
-@looks_at_volumes
 def few(experiment):
-    """Assume that scans are taken."""
     note("few", experiment)
     found = measure(experiment, OPTIONS)
-    amplitude = np.full_like(found.amplitude, np.nan)
+    amplitude = np.full_like(found.motion.amplitude, np.nan)
     steps = [scan.step for scan in experiment.interrupted]
-    amplitude[steps] = found.amplitude[steps]
-    return replace(found, amplitude=amplitude)
+    amplitude[steps] = found.motion.amplitude[steps]
+    return replace(found, motion=replace(found.motion, amplitude=amplitude))
 
 
 def broken(experiment):
-    """Assume too much."""
     note("broken", experiment)
     raise ValueError("radiographs: expected other ones,\\n found these")
 
 
 def wrong(experiment):
-    """Assume that a number will do."""
     return 7
+
+
+EVERY = Method(name="every", measure=every, assumes="Assume that four sections will do.")
+FEW = Method(name="few", measure=few, assumes="Assume that scans are taken.", looks_at="volumes")
+BROKEN = Method(name="broken", measure=broken, assumes="Assume too much.")
+WRONG = Method(name="wrong", measure=wrong, assumes="Assume that a number will do.")
 '''
 
 
@@ -268,7 +267,7 @@ def wrong(experiment):
 def done(tmp_path_factory):
     """Compare three made-up methods as a user does it, twice; the tests below look at what that left."""
     folder = tmp_path_factory.mktemp("compare")
-    methods = {name: f"made_up_methods:{name}" for name in ("every", "few", "broken", "wrong")}
+    methods = {name: f"made_up_methods:{name.upper()}" for name in ("every", "few", "broken", "wrong")}
     install(folder, methods, MODULE, name="made_up_methods")
     (folder / "tiny.toml").write_text(SMALL)
     arguments = ("compare", folder / "tiny.toml", "--methods", "every,few,broken,wrong", "-o", folder / "out")

@@ -51,12 +51,12 @@ def test_a_method_is_found_by_its_entry_point_and_measures(tmp_path, monkeypatch
     method = find_method("follows-force")
     assert method.assumes.startswith("Assume that the sample moves in proportion to the force")
     small = SmallExperiment(small_scenario({"motion.ingredients": ["tension", "compliance"]}))
-    found = method.function(small.experiment)
-    assert len(found.time_functions) == 2
+    found = method.measure(small.experiment)
+    assert len(found.motion.time_functions) == 2
     # what it assumes holds but for plastic strain, which is no multiple of the force
     assert score(found, small.truth).error_voxel.across_beam < 0.3
     still = SmallExperiment(small_scenario({"motion.ingredients": ["wobble"]}))
-    assert score(method.function(still.experiment), still.truth).error_voxel.across_beam > 0.2
+    assert score(method.measure(still.experiment), still.truth).error_voxel.across_beam > 0.2
 
 
 def test_a_study_is_run_from_python(tmp_path, monkeypatch, capsys):

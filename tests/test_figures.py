@@ -20,7 +20,7 @@ def case():
 
 def test_residuals_of_a_row_share_one_symmetric_scale(case):
     measurement, _ = case
-    fields = measurement.residual_initial[[3, 12, 20]]
+    fields = measurement.fit.residual_initial[[3, 12, 20]]
     _, axes = figures.new_figure(8, 4, 3)
     limit = figures.scale_limit(list(fields))
     figures.draw_residuals(fields, ["a", "b", "c"], axes, limit=limit)
@@ -51,8 +51,8 @@ def test_translations_are_those_of_the_record(case):
 def test_force_marks_the_selected_steps(case):
     measurement, _ = case
     _, (ax,) = figures.new_figure(7, 3)
-    figures.draw_force(measurement.time_s, measurement.force_N, [3, 20], ax)
-    np.testing.assert_array_equal(ax.lines[1].get_xdata(), measurement.time_s[[3, 20]])
+    figures.draw_force(measurement.recording.time_s, measurement.recording.force_N, [3, 20], ax)
+    np.testing.assert_array_equal(ax.lines[1].get_xdata(), measurement.recording.time_s[[3, 20]])
 
 
 def test_difference_maps_vanish_for_a_perfect_measurement_and_hide_the_unobserved(case):
@@ -104,7 +104,7 @@ def test_snr_without_known_noise_has_no_limit_line(case):
     unknown = np.full(records.STEPS, np.nan)
     _, (ax,) = figures.new_figure(7, 3)
     m = measurement
-    figures.draw_snr(m.snr_initial_db, m.snr_rigid_db, m.snr_final_db, unknown, float("nan"), ax)
+    figures.draw_snr(m.fit.snr_initial_db, m.fit.snr_rigid_db, m.fit.snr_final_db, unknown, float("nan"), ax)
     assert len(ax.lines) == 3
 
 
@@ -112,7 +112,7 @@ def test_radiographs_show_the_used_window(case):
     measurement, _ = case
     images = np.random.default_rng(1).random((2, 80, 40))
     figure, axes = figures.new_figure(6, 4, 2)
-    figures.draw_radiographs(images, ["a", "b"], axes, window=measurement.window)
+    figures.draw_radiographs(images, ["a", "b"], axes, window=measurement.recording.window)
     np.testing.assert_array_equal(axes[0].lines[0].get_xdata(), np.array([6, 34, 34, 6, 6]) - 0.5)
     figure.draw_without_rendering()
 

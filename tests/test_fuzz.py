@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 
 from benchmarks.faults import SCENARIO, STUDY
 from pdvc.experiment import Description, ExperimentError, read_experiment
-from pdvc.measurement import read_measurement
+from pdvc.measurement_file import read_measurement
 from pdvc.options import MeasureOptions
 from pdvc.result_checks import check_finite
 from pdvc.settings import SettingsError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pdvc.experiment import DESCRIPTION, Description, write_description
-from pdvc.measurement import read_measurement
+from pdvc.measurement_file import read_measurement
 from tests.command_line import only_line, pdvc_bench
 from tests.tiny_scenarios import TINY
 
@@ -174,8 +174,8 @@ def test_inspect_shows_what_is_found_and_proposed(job):
     assert "60 reference views, 25 steps" in found
     assert re.search(r"loading begins after step (9|10|11) ", found)
     measured = read_measurement(folder / "out" / "measurement.nc")
-    assert f"discard_rows = {measured.window[0]}" in found
-    assert f"unknowns {measured.unknowns} " in found
+    assert f"discard_rows = {measured.recording.window[0]}" in found
+    assert f"unknowns {measured.fit.unknowns} " in found
 
 
 def test_inspect_names_a_stage_that_turns_the_other_way(turned, job):

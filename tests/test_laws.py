@@ -27,6 +27,7 @@ from simulator.scenario import course_of
 from simulator.truth import sample_truth
 from simulator.views import prepare, step_image, view_image
 from tests.laws import law
+from tests.synthetic_records import altered
 from validation.scoring.bound import bound_of
 from validation.scoring.scores import point_errors
 from validation.testing.small_cases import SmallExperiment
@@ -92,7 +93,7 @@ def difference(one, its_truth, other, other_truth):
 
 def in_deviations(one, other):
     """Return the rms of a difference of amplitudes over their standard deviation."""
-    share = (other.amplitude - one.amplitude) / one.amplitude_std
+    share = (other.motion.amplitude - one.motion.amplitude) / one.motion.amplitude_std
     return np.sqrt(np.nanmean(share**2))
 
 
@@ -118,11 +119,11 @@ def test_an_offset_by_quarter_turns_changes_nothing_else(small, quarters):
     """The grid of voxels is turned into itself: nothing is interpolated otherwise."""
     offset = quarters * np.pi / 2
     found = measure(with_offset(small.experiment, offset), small.options)
-    back = found.amplitude.copy()
+    back = found.motion.amplitude.copy()
     for k in (0, 3):  # translations, and rotations, which are vectors about the axis too
-        back[..., k : k + 3] = seen_from(found.amplitude[..., k : k + 3], -offset)
-    np.testing.assert_allclose(found.basis.radius_mm, small.measurement.basis.radius_mm, rtol=1e-6)
-    assert in_deviations(small.measurement, replace(found, amplitude=back)) < 1
+        back[..., k : k + 3] = seen_from(found.motion.amplitude[..., k : k + 3], -offset)
+    np.testing.assert_allclose(found.motion.basis.radius_mm, small.measurement.motion.basis.radius_mm, rtol=1e-6)
+    assert in_deviations(small.measurement, altered(found, amplitude=back)) < 1
 
 
 @THROUGH
@@ -147,7 +148,7 @@ def test_rows_stored_beyond_the_used_window_do_not_matter(small, top, bottom, mo
     heights = -((edges - rows / 2) * recorded.pixel_mm + recorded.row_shift_mm) / recorded.magnification
     for found in (whole, cut):
         # a roll of one degree shortens heights by 1.5e-4 of them
-        np.testing.assert_allclose(found.basis.height_mm[[0, -1]], heights, atol=2e-4)
+        np.testing.assert_allclose(found.motion.basis.height_mm[[0, -1]], heights, atol=2e-4)
     assert in_deviations(whole, cut) < 1
 
 
@@ -175,7 +176,7 @@ def test_a_sample_mounted_elsewhere_moves_alike(small, shift):
     found = measure(elsewhere, small.options)
     moved = replace(truth, point_mm=truth.point_mm + shift)
     across, vertical, _ = difference(found, moved, small.measurement, small.truth)
-    noise = np.sqrt((small.measurement.amplitude_std[..., :3] ** 2).mean())
+    noise = np.sqrt((small.measurement.motion.amplitude_std[..., :3] ** 2).mean())
     assert max(across, vertical) < np.hypot(INTERPOLATION_VOXEL, np.sqrt(2) * noise)
 
 
@@ -198,8 +199,8 @@ def test_another_gain_and_another_dark_level_change_nothing(small, gain, dark):
     )
     found, expected = measure(louder, options), measure(here, options)
     assert in_deviations(expected, found) < 0.01
-    np.testing.assert_allclose(found.amplitude_std, expected.amplitude_std, rtol=1e-2)
-    np.testing.assert_allclose(found.snr_noise_db, expected.snr_noise_db, atol=1e-3)
+    np.testing.assert_allclose(found.motion.amplitude_std, expected.motion.amplitude_std, rtol=1e-2)
+    np.testing.assert_allclose(found.fit.snr_noise_db, expected.fit.snr_noise_db, atol=1e-3)
 
 
 @THROUGH
@@ -225,7 +226,7 @@ def test_steps_in_another_order_are_measured_alike(small, seed):
     # the noise that all images share is summed over them in single precision
     for name in ("amplitude_std", "data_share"):
         np.testing.assert_allclose(getattr(two, name), getattr(one, name)[order], rtol=1e-4, err_msg=name)
-    np.testing.assert_array_equal(two.residual_initial, one.residual_initial[order])
+    np.testing.assert_array_equal(two.fit.residual_initial, one.fit.residual_initial[order])
 
 
 @THROUGH
@@ -235,7 +236,7 @@ def test_with_a_quarter_of_the_photons_every_amplitude_is_less_well_known(small)
     scenario = small.scenario
     detector = scenario.detector.model_copy(update={"photons_per_pixel": scenario.detector.photons_per_pixel / 4})
     dim = SmallExperiment(scenario.model_copy(update={"detector": detector}))
-    ratio = dim.measurement.amplitude_std / small.measurement.amplitude_std
+    ratio = dim.measurement.motion.amplitude_std / small.measurement.motion.amplitude_std
     assert ratio.min() > 1
     assert ratio.mean() < 2.2
 
@@ -249,6 +250,6 @@ def test_with_fewer_photons_the_bound_grows_in_every_direction_and_no_more_than_
     bright, _ = bound_of(scenario, small.options)
     dim, _ = bound_of(scenario.model_copy(update={"detector": detector}), small.options)
     # whatever is asked of the unknowns, not only each of them by itself: generalised eigenvalues
-    growth = linalg.eigh(dim.covariance, bright.covariance, eigvals_only=True)
+    growth = linalg.eigh(dim.motion.covariance, bright.motion.covariance, eigvals_only=True)
     assert growth.min() > 1
     assert growth.max() < fewer

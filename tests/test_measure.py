@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pdvc.measure import measure
 from pdvc.options import StageOptions
+from pdvc.pgd import Pgd
 from validation.testing.small_cases import SmallExperiment, small_scenario
 
 
@@ -17,11 +18,11 @@ def test_the_last_stage_ends_at_the_noise_but_not_the_rigid_one_that_it_starts_f
     small = SmallExperiment(scenario)
     options = small.options.model_copy(
         update={
-            "rigid": (StageOptions(scale=2, most=3),),
-            "deformation": (StageOptions(scale=1, most=3),),
+            "rigid": (StageOptions(scale=2, solver=Pgd(most_modes=3)),),
+            "deformation": (StageOptions(scale=1, solver=Pgd(most_modes=3)),),
         }
     )
-    rigid, sections = measure(small.experiment, options).stages
+    rigid, sections = measure(small.experiment, options).fit.stages
     assert "residual at noise level" in sections.stop_reason
     assert len(sections.temporal) == 0
     assert "noise level" not in rigid.stop_reason

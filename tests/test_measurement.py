@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pdvc.measurement import MeasurementError, read_measurement, write_measurement
+from pdvc.measurement import MeasurementError
+from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
 from tests import synthetic_records as records
 
@@ -18,9 +19,9 @@ RESIDUALS = ("residual_initial", "residual_rigid", "residual_final")
 def measured():
     amplitude = np.random.default_rng(5).normal(size=(records.STEPS, 9, 6))
     record = records.measurement(amplitude, unobserved=(0, 8), title="dog-bone, 'A' # 1")
-    residual = record.residual_final.copy()
+    residual = record.fit.residual_final.copy()
     residual[3, :2] = np.nan
-    return replace(record, residual_final=residual, snr_noise_db=np.full(records.STEPS, np.nan), options="")
+    return records.altered(record, residual_final=residual, snr_noise_db=np.full(records.STEPS, np.nan), options="")
 
 
 def assert_same(one, two, name):
@@ -37,10 +38,10 @@ def test_every_field_comes_back(measured, tmp_path):
     for field in fields(measured):
         if field.name not in (*RESIDUALS, "basis", "stages"):
             assert_same(getattr(measured, field.name), getattr(again, field.name), field.name)
-    for field in fields(measured.basis):
-        assert_same(getattr(measured.basis, field.name), getattr(again.basis, field.name), field.name)
-    assert len(again.stages) == len(measured.stages)
-    for one, two in zip(measured.stages, again.stages, strict=True):
+    for field in fields(measured.motion.basis):
+        assert_same(getattr(measured.motion.basis, field.name), getattr(again.motion.basis, field.name), field.name)
+    assert len(again.fit.stages) == len(measured.fit.stages)
+    for one, two in zip(measured.fit.stages, again.fit.stages, strict=True):
         for field in fields(one):
             assert_same(getattr(one, field.name), getattr(two, field.name), field.name)
 
@@ -50,39 +51,41 @@ def test_residuals_come_back_to_half_their_quantum_and_their_gaps_as_gaps(measur
     again = read_measurement(tmp_path / "a.nc")
     for name in RESIDUALS:
         np.testing.assert_allclose(getattr(again, name), getattr(measured, name), atol=5.1e-5, err_msg=name)
-    assert np.isnan(again.residual_final[3, :2]).all()
+    assert np.isnan(again.fit.residual_final[3, :2]).all()
 
 
 def test_residuals_too_large_for_the_quantum_come_back_with_a_coarser_one(measured, tmp_path):
-    residual = measured.residual_initial.copy()
+    residual = measured.fit.residual_initial.copy()
     residual[0, 0, 0] = 5
-    write_measurement(replace(measured, residual_initial=residual), tmp_path / "a.nc")
+    write_measurement(records.altered(measured, residual_initial=residual), tmp_path / "a.nc")
     again = read_measurement(tmp_path / "a.nc")
-    np.testing.assert_allclose(again.residual_initial, residual, atol=0.51 * 5 / 32767)
+    np.testing.assert_allclose(again.fit.residual_initial, residual, atol=0.51 * 5 / 32767)
 
 
 def test_stages_with_other_motions_than_the_sections_come_back(tmp_path):
     """The rigid body has six motions where the sections contract, too."""
     record = records.measurement(np.random.default_rng(0).normal(size=(records.STEPS, 9, 7)))
-    basis = SectionBasis(height_mm=record.basis.height_mm, radius_mm=0.6, motions=(*RIGID, CONTRACTION))
-    rigid = replace(record.stages[0], spatial=np.random.default_rng(1).normal(size=(5, 1, 6)))
-    stages = (rigid, *record.stages[1:])
-    write_measurement(replace(record, basis=basis, stages=stages), tmp_path / "a.nc")
+    basis = SectionBasis(height_mm=record.motion.basis.height_mm, radius_mm=0.6, motions=(*RIGID, CONTRACTION))
+    rigid = replace(record.fit.stages[0], spatial=np.random.default_rng(1).normal(size=(5, 1, 6)))
+    stages = (rigid, *record.fit.stages[1:])
+    write_measurement(records.altered(record, basis=basis, stages=stages), tmp_path / "a.nc")
     again = read_measurement(tmp_path / "a.nc")
-    assert again.basis.motions == basis.motions
-    for one, two in zip(again.stages, stages, strict=True):
+    assert again.motion.basis.motions == basis.motions
+    for one, two in zip(again.fit.stages, stages, strict=True):
         np.testing.assert_array_equal(one.spatial, two.spatial)
 
 
 def test_a_displacement_is_unknown_only_next_to_an_unobserved_section(measured):
-    first, second, third = measured.basis.height_mm[:3]
-    u = measured.displacement(4, np.array([[0, 0, (first + second) / 2], [0.1, 0, (second + third) / 2]]))
+    first, second, third = measured.motion.basis.height_mm[:3]
+    u = measured.motion.displacement(4, np.array([[0, 0, (first + second) / 2], [0.1, 0, (second + third) / 2]]))
     np.testing.assert_array_equal(np.isnan(u).any(axis=1), [True, False])
 
 
 def test_a_solver_without_modes_has_none_when_read_back(measured, tmp_path):
-    stage = replace(measured.stages[1], solver="gauss-newton", temporal=np.empty((0, 24)), spatial=np.empty((0, 9, 6)))
-    write_measurement(replace(measured, stages=(measured.stages[0], stage)), tmp_path / "a.nc")
+    stage = replace(
+        measured.fit.stages[1], solver="gauss-newton", temporal=np.empty((0, 24)), spatial=np.empty((0, 9, 6))
+    )
+    write_measurement(records.altered(measured, stages=(measured.fit.stages[0], stage)), tmp_path / "a.nc")
     again = read_measurement(tmp_path / "a.nc").stages[1]
     assert again.modes == 0
     assert again.spatial.shape == (0, 9, 6)

@@ -12,9 +12,15 @@ import pytest
 from pdvc.history import Steps
 from pdvc.options import MeasureOptions, paper_options
 from tests.command_line import install
+from validation.methods import own
 from validation.methods import registry as methods
 from validation.methods.registry import MethodError, find_method, method_names
 
+METHOD = """
+from validation.methods.registry import Method
+
+MINE = Method(name="{name}", measure=print, assumes="{assumes}")
+"""
 ROOT = Path(__file__).parent.parent
 OURS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][methods.GROUP]
 
@@ -51,8 +57,8 @@ def test_the_example_of_the_documentation_is_found_and_measures(site, monkeypatc
     assert method.assumes == "Assume that five sections are enough for the whole sample."
     assert method.looks_at == "projections"
     handed = []
-    monkeypatch.setattr(f"{method.function.__module__}.measure", lambda *given: handed.append(given))
-    method.function("an experiment")
+    monkeypatch.setattr(f"{method.measure.__module__}.measure", lambda *given: handed.append(given))
+    method.measure("an experiment")
     ((experiment, options),) = handed
     assert experiment == "an experiment"
     assert options.sections == 5
@@ -61,11 +67,11 @@ def test_the_example_of_the_documentation_is_found_and_measures(site, monkeypatc
 
 def test_classical_dvc_is_told_to_use_scans_and_measures_with_the_default_sections(monkeypatch):
     handed = []
-    monkeypatch.setattr(methods, "correlate", lambda *given: handed.append(given))
+    monkeypatch.setattr(own, "correlate", lambda *given: handed.append(given))
     method = find_method("classical-dvc")
     assert method.looks_at == "volumes"
     assert [name for name in OURS if find_method(name).looks_at == "volumes"] == ["classical-dvc", "spam"]
-    method.function("an experiment")
+    method.measure("an experiment")
     ((experiment, options),) = handed
     assert experiment == "an experiment"
     assert (options.sections, options.section_motions) == (15, MeasureOptions().section_motions)
@@ -74,8 +80,8 @@ def test_classical_dvc_is_told_to_use_scans_and_measures_with_the_default_sectio
 def options_of(name, monkeypatch, *, rows=238, steps=127):
     """Return the options that one of our methods hands to `measure`."""
     handed = []
-    monkeypatch.setattr(methods, "measure", lambda _, options: handed.append(options))
-    find_method(name).function(SimpleNamespace(geometry=SimpleNamespace(rows=rows), test=range(steps)))
+    monkeypatch.setattr(own, "measure", lambda _, options: handed.append(options))
+    find_method(name).measure(SimpleNamespace(geometry=SimpleNamespace(rows=rows), test=range(steps)))
     (options,) = handed
     return options
 
@@ -83,7 +89,7 @@ def options_of(name, monkeypatch, *, rows=238, steps=127):
 def test_pgd_is_the_paper_s_protocol_and_the_others_solve_directly(monkeypatch):
     assert options_of("pgd", monkeypatch) == paper_options()
     plain, weighted = options_of("gauss-newton", monkeypatch), options_of("weighted", monkeypatch)
-    assert {stage.solver for stage in (*plain.rigid, *plain.deformation)} == {"gauss-newton"}
+    assert {stage.solver.kind for stage in (*plain.rigid, *plain.deformation)} == {"gauss-newton"}
     assert (plain.weighting, weighted.weighting) == ("uniform", "noise")
     assert weighted.model_copy(update={"weighting": "uniform"}) == plain
 
@@ -119,14 +125,18 @@ def test_an_unlike_name_gets_the_list_alone():
     ("module", "told"),
     [
         ("import nothing_like_this", "cannot load it: No module named 'nothing_like_this'"),
-        ("", "cannot load it: module 'wrong' has no attribute 'function'"),
-        ("function = 7", "expected a function at wrong:function, found int"),
-        ("def function(experiment): ...", "that says what the method assumes"),
+        ("", "cannot load it: module 'wrong' has no attribute 'MINE'"),
+        ("MINE = 7", "expected a Method at wrong:MINE, found int"),
+        (
+            METHOD.format(name="yours", assumes="Assume it."),
+            "expected a Method of this name at wrong:MINE, found 'yours'",
+        ),
+        (METHOD.format(name="mine", assumes=" "), "expected wrong:MINE to say what the method assumes"),
     ],
 )
 def test_what_is_no_method_is_answered_in_one_line(site, monkeypatch, module, told):
     monkeypatch.delitem(__import__("sys").modules, "wrong", raising=False)
-    install(site, {"mine": "wrong:function"}, module, name="wrong")
+    install(site, {"mine": "wrong:MINE"}, module, name="wrong")
     with pytest.raises(MethodError, match=re.escape(told)) as caught:
         find_method("mine")
     assert str(caught.value).startswith("method 'mine': expected ")
@@ -137,13 +147,6 @@ def test_a_name_offered_twice_is_refused(site):
     install(site, {"pgd": "other:function"}, "", name="other")
     with pytest.raises(MethodError, match=r"found several: other, pdvc-bench"):
         find_method("pgd")
-
-
-def test_a_method_may_look_at_volumes():
-    def scans(experiment):
-        """Assume nothing."""
-
-    assert methods.Method(name="scans", function=methods.looks_at_volumes(scans)).looks_at == "volumes"
 
 
 def test_without_any_entry_point_the_installation_is_to_blame(monkeypatch):

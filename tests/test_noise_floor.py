@@ -23,7 +23,7 @@ def tensile_test(amplitude, *, constant=TURN, **changes):
     """Return a measurement whose force stays at 250 N for some steps and then rises by 12 N a step, noise of 1 N."""
     force = 250.0 + 12 * np.clip(np.arange(STEPS) - constant + 1, 0, None)
     force += np.random.default_rng(5).normal(size=STEPS)
-    return replace(records.measurement(amplitude, **changes), force_N=force)
+    return records.altered(records.measurement(amplitude, **changes), force_N=force)
 
 
 def still():
@@ -196,9 +196,9 @@ def test_histories_are_those_that_differ_over_the_constant_load():
     steps = np.arange(STEPS)
     ramp = np.clip(steps - TURN + 1, 0, None)
     functions = np.stack([np.ones(STEPS), steps - STEPS / 2, ramp, ramp**2]).astype(float)
-    measurement = replace(tensile_test(still()), time_functions=functions)
+    measurement = records.altered(tensile_test(still()), time_functions=functions)
     assert noise_floor(measurement).histories == 2
-    each = replace(measurement, time_functions=np.eye(STEPS))
+    each = records.altered(measurement, time_functions=np.eye(STEPS))
     assert noise_floor(each).histories == TURN
 
 

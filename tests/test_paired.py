@@ -141,7 +141,7 @@ def test_errors_of_a_measurement_are_those_that_scores_are_made_of():
     amplitude[..., 2] += 0.05
     amplitude[4:9] = np.nan
     measurement = records.measurement(amplitude)
-    spacing = float(np.mean(np.diff(measurement.basis.height_mm)))
+    spacing = float(np.mean(np.diff(measurement.motion.basis.height_mm)))
     errors, scores = errors_of(measurement, truth, spacing_mm=spacing), score(measurement, truth)
     across, vertical, along, strain = errors.rms(errors.known)
     assert vertical == pytest.approx(scores.error_voxel.vertical, rel=1e-5)

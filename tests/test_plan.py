@@ -18,7 +18,7 @@ from simulator.truth import read_truth
 from tests.command_line import pdvc_bench
 from tests.laws import law
 from tests.tiny_scenarios import TINY, trial
-from validation.plan.plan import _stretched, designs_around, plan
+from validation.plan.designs import design_of, plan
 from validation.plan.tables import designs_csv, designs_table, weak_table
 from validation.scoring.interval_calibration import interval_calibration
 from validation.scoring.scores import point_errors
@@ -29,7 +29,7 @@ ONE = trial({"sections": 4})
 
 @pytest.fixture(scope="module")
 def planned():
-    own, _ = designs_around(ONE.scenario, ONE.options)
+    own = design_of(ONE.scenario, ONE.options)
     designs = (
         replace(own, frames=4 * own.frames),
         replace(own, steps_per_turn=2 * own.steps_per_turn),
@@ -70,7 +70,7 @@ def test_the_weakest_motions_are_told_in_order(planned):
     assert shares == sorted(shares, reverse=True)
     assert all(each.deviation_voxel[2] > each.deviation_voxel[0] for each in planned.weak[:1])
     assert weak_table(planned).row_count == len(planned.weak) == 6
-    assert designs_table(planned, ONE.scenario).row_count == 5
+    assert designs_table(planned, ONE.scenario.name).row_count == 5
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_a_test_that_hardly_turns_hides_what_moves_along_its_beam(beam_deg, phot
             "detector.photons_per_pixel": photons,
         }
     )
-    found = plan(scenario, small_options(scenario).model_copy(update={"sections": 3}), [], weakest=3)
+    found = plan(scenario, small_options(scenario).model_copy(update={"sections": 3}), [], count=3)
     assert set(found.weak[0].motions) == named
     for each in found.weak:
         across, vertical, along = each.deviation_voxel
@@ -131,7 +131,7 @@ def test_stretched_time_functions_are_the_same_functions_of_time(times, steps, d
         return time_basis(parts, series)
 
     own = basis((Polynomial(degree=0), part), steps)
-    often = basis(_stretched((Polynomial(degree=0), part), times), times * steps)[:, ::times]
+    often = basis([each.stretched(times) for each in (Polynomial(degree=0), part)], times * steps)[:, ::times]
     span, _ = np.linalg.qr(own.T)
     assert np.linalg.matrix_rank(often, tol=1e-6) == len(own)
     np.testing.assert_allclose(often.T, span @ (span.T @ often.T), atol=1e-9)

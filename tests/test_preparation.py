@@ -7,12 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pdvc.options import resolved
-from pdvc.preparation import calibrated, prepare
-from pdvc.progress import silent
+from pdvc.preparation import prepare
 from pdvc.radiographs import calibrate
-from pdvc.store import Store
-from pdvc.window import used_window
+from pdvc.setup import set_up
 from validation.scoring.bound import noise_free
 from validation.testing.small_cases import SmallExperiment, small_scenario
 
@@ -51,33 +48,23 @@ def test_a_coarse_pixel_counts_where_more_than_two_thirds_of_it_were_measured(sc
 
     One dead pixel of four is let pass, or a detector with one in a hundred would lose four at the coarse scale.
     """
-    options = resolved(SMALL.options, SMALL.experiment.geometry)
     row, column = 12 * scale, 6 * scale
-    experiment = with_dead_pixels(SMALL.experiment, [(row + i, column + j) for i, j in dead])
-    store = Store(None, experiment)
-    calibration, outline = calibrated(experiment, options, store, silent)
-    assert calibration.bad.sum() == len(dead)
-    window = used_window(experiment.geometry, options, outline.hull)
-    weight = prepare(experiment, calibration, outline, window, scale, options, store, silent).images.weight[0]
+    setup = set_up(with_dead_pixels(SMALL.experiment, [(row + i, column + j) for i, j in dead]), SMALL.options)
+    assert setup.calibration.bad.sum() == len(dead)
+    weight = prepare(setup, scale).images.weight[0]
     expected = np.ones_like(weight)
-    expected[12 - window[0] // scale, 6 - window[2] // scale] = counts
+    expected[12 - setup.window[0] // scale, 6 - setup.window[2] // scale] = counts
     np.testing.assert_array_equal(weight, expected)
 
 
 @pytest.mark.parametrize("scale", [1, 2])
 def test_the_noise_told_of_the_radiographs_is_what_they_differ_by_from_those_without_noise(scale):
     """Photons, readout and the two flats, which make a third of it in air, after filter and binning."""
-    clean = SmallExperiment(noise_free(SMALL.scenario)).experiment
-    noisy, options = SMALL.experiment, resolved(SMALL.options, SMALL.experiment.geometry)
-    calibration, outline = calibrated(clean, options, Store(None, clean), silent)
-    window = used_window(clean.geometry, options, outline.hull)
-
-    def seen(experiment, corrected):
-        store = Store(None, experiment)
-        return prepare(experiment, corrected, outline, window, scale, options, store, silent)
-
-    told = seen(noisy, calibrate(noisy).with_polynomial(outline.polynomial))
-    apart = told.images.grey.astype(float) - seen(clean, calibration).images.grey
+    clean = set_up(SmallExperiment(noise_free(SMALL.scenario)).experiment, SMALL.options)
+    calibration = calibrate(SMALL.experiment).with_polynomial(clean.outline.polynomial)
+    noisy = replace(clean, experiment=SMALL.experiment, calibration=calibration)
+    told = prepare(noisy, scale)
+    apart = told.images.grey.astype(float) - prepare(clean, scale).images.grey
     # twenty thousand pixels, of which a filter leaves every fifth by itself; at scale 2 a quarter
     assert told.noise_rms == pytest.approx(np.sqrt((apart**2).mean()), rel=0.04)
     signal = told.images.grey.std(axis=(1, 2), dtype=float)

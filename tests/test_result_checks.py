@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdvc.geometry import ConeBeam
-from pdvc.measurement import ResidualTests, read_measurement, write_measurement
+from pdvc.measurement import ResidualTests
+from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.result_checks import cut_rows, doubts_of_result, doubts_of_solution
 from pdvc.verdict import Doubt, Stop, Verdict, explained_by, listed
 from pdvc.volume import Grid, Volume, hull_of
-from tests.synthetic_records import HEIGHT_MM, VOXEL_MM, measurement, stretched, tensile_history
+from tests.synthetic_records import HEIGHT_MM, VOXEL_MM, altered, measurement, stretched, tensile_history
 
 BEAM = ConeBeam(source_axis_mm=28.57, source_detector_mm=800.0, pixel_mm=0.2996 * 9, rows=80, columns=40)
 """Its used rows, 10 to 69 of 80, see the sections of the synthetic record, about."""
@@ -35,12 +36,12 @@ def result(**changes):
     _, amplitude = stretched(*tensile_history())
     found = measurement(amplitude)
     good = {
-        "data_share": np.ones_like(found.amplitude),
+        "data_share": np.ones_like(found.motion.amplitude),
         "residual_tests": ResidualTests(
             chi2_reduced=1.1, lag1_row=0.1, lag1_column=0.1, lag1_row_expected=0.1, lag1_column_expected=0.1
         ),
     }
-    return replace(found, **{**good, **changes})
+    return altered(found, **{**good, **changes})
 
 
 def doubts(found, of=None, prior_voxel=30.0):
@@ -64,23 +65,23 @@ def strained(largest):
 
 
 def holding(chi2):
-    return replace(result().residual_tests, chi2_reduced=chi2)
+    return replace(result().fit.residual_tests, chi2_reduced=chi2)
 
 
 GOOD = result()
-LAST = GOOD.stages[-1]
+LAST = GOOD.fit.stages[-1]
 DOUBTED = {
     "reference-volume": (result(snr_reprojection_db=np.full(40, 12.0), snr_final_db=np.full(24, 16.0)), False, ()),
     "not-explained": (result(snr_final_db=np.full(24, 12.0)), False, ()),
-    "step-residual": (result(snr_final_db=with_step(GOOD.snr_final_db, 9, 18.0)), False, (9,)),
+    "step-residual": (result(snr_final_db=with_step(GOOD.fit.snr_final_db, 9, 18.0)), False, (9,)),
     "more-than-noise": (result(residual_tests=holding(9.0)), False, ()),
     "noise-level": (result(residual_tests=holding(0.1)), False, ()),
-    "unobserved": (result(observed=with_step(GOOD.observed, 0, False)), False, ()),
+    "unobserved": (result(observed=with_step(GOOD.motion.observed, 0, False)), False, ()),
     "strain": (result(amplitude=strained(0.7)), False, (20, 21, 22, 23)),
-    "prior-alone": (result(data_share=0.3 * np.ones_like(GOOD.amplitude)), False, ()),
-    "not-converged": (result(stages=(GOOD.stages[0], replace(LAST, stop=Stop.UNFINISHED))), False, ()),
-    "force": (result(force_N=GOOD.force_N * 1e6), False, ()),
-    "not-finite": (result(amplitude=with_step(GOOD.amplitude, 3, np.nan)), True, ()),
+    "prior-alone": (result(data_share=0.3 * np.ones_like(GOOD.motion.amplitude)), False, ()),
+    "not-converged": (result(stages=(GOOD.fit.stages[0], replace(LAST, stop=Stop.UNFINISHED))), False, ()),
+    "force": (result(force_N=GOOD.recording.force_N * 1e6), False, ()),
+    "not-finite": (result(amplitude=with_step(GOOD.motion.amplitude, 3, np.nan)), True, ()),
 }
 
 
@@ -96,7 +97,7 @@ def test_each_doubt_has_its_cause_alone(name):
 
 
 def test_sections_that_change_places_are_no_motion_of_a_sample():
-    amplitude = GOOD.amplitude.copy()
+    amplitude = GOOD.motion.amplitude.copy()
     amplitude[5, 4, 2] += 2 * (HEIGHT_MM[1] - HEIGHT_MM[0]) / VOXEL_MM
     assert doubts(result(amplitude=amplitude))["folded"].steps == (5,)
     amplitude[:, 4, 2] += 2 * (HEIGHT_MM[1] - HEIGHT_MM[0]) / VOXEL_MM
@@ -110,9 +111,9 @@ def test_a_prior_that_is_too_narrow_is_told_by_its_own_deviations():
 
 def test_a_solution_that_hardly_moves_any_more_has_converged():
     still = replace(LAST, stop=Stop.UNFINISHED, last_change_voxel=0.004)
-    assert doubts(result(stages=(GOOD.stages[0], still))) == {}
+    assert doubts(result(stages=(GOOD.fit.stages[0], still))) == {}
     far = replace(still, last_change_voxel=0.4)
-    assert set(doubts(result(stages=(GOOD.stages[0], far)))) == {"not-converged"}
+    assert set(doubts(result(stages=(GOOD.fit.stages[0], far)))) == {"not-converged"}
 
 
 def test_what_is_explained_by_nothing_is_fatal():
@@ -134,26 +135,30 @@ def test_as_many_functions_as_steps_join_nothing():
 @settings(deadline=None, max_examples=30)
 def test_rows_through_a_cut_end_are_those_whose_rays_leave_it(half_mm, rise_mm):
     """Oracle: points along the rays at both sides of the sample, moved back, one by one."""
-    still = np.zeros_like(GOOD.amplitude)
+    still = np.zeros_like(GOOD.motion.amplitude)
     still[..., 2] = rise_mm / VOXEL_MM
     found, cut = result(amplitude=still), volume(half_mm)
     low, high = cut.hull.box_mm()
     reach = np.hypot(*np.maximum(-low, high)[:2])
     bottom, top = cut.grid.origin_mm[2] + 0.1, cut.grid.origin_mm[2] + 0.1 * (cut.grid.shape[0] - 2)
     leave = 0
-    for row in range(*found.window[:2]):
+    for row in range(*found.recording.window[:2]):
         down = (row - (BEAM.rows - 1) / 2) * BEAM.pixel_mm / BEAM.source_detector_mm
         heights = [-down * (BEAM.source_axis_mm + side * reach) - rise_mm for side in (-1, 1)]
         leave += not all(bottom <= height <= top for height in heights)
-    np.testing.assert_allclose(cut_rows(found, cut, BEAM), leave / (found.window[1] - found.window[0]))
-    assert ("cut-ends" in doubts(found, cut)) == (leave / (found.window[1] - found.window[0]) > 0.02)
+    np.testing.assert_allclose(
+        cut_rows(found, cut, BEAM), leave / (found.recording.window[1] - found.recording.window[0])
+    )
+    assert ("cut-ends" in doubts(found, cut)) == (
+        leave / (found.recording.window[1] - found.recording.window[0]) > 0.02
+    )
 
 
 def test_the_rows_to_leave_out_are_enough():
-    found = result(amplitude=0 * GOOD.amplitude)
+    found = result(amplitude=0 * GOOD.motion.amplitude)
     advice = doubts(found, volume(2.6))["cut-ends"].advice
     rows = int(advice.rpartition("= ")[2])
-    narrower = replace(found, window=(rows, BEAM.rows - rows, *found.window[2:]))
+    narrower = altered(found, window=(rows, BEAM.rows - rows, *found.recording.window[2:]))
     assert "cut-ends" not in doubts(narrower, volume(2.6))
 
 
@@ -162,7 +167,7 @@ def test_a_window_that_leaves_out_the_sample_s_edges_is_named():
     finer = replace(BEAM, pixel_mm=BEAM.pixel_mm / 4, rows=4 * BEAM.rows, columns=4 * BEAM.columns)
 
     def names(left, right):
-        found = replace(result(), window=(40, 280, left, right))
+        found = altered(result(), window=(40, 280, left, right))
         return {each.name for each in doubts_of_result(found, volume(), finer, 30.0)}
 
     assert "narrow-window" in names(72, 88)
@@ -173,7 +178,7 @@ def test_a_window_that_leaves_out_the_sample_s_edges_is_named():
 
 
 def test_a_measurement_from_scans_is_judged_at_its_scans():
-    amplitude = np.full_like(GOOD.amplitude, np.nan)
+    amplitude = np.full_like(GOOD.motion.amplitude, np.nan)
     amplitude[[4, 17]] = strained(0.7)[[20, 23]]
     found = result(amplitude=amplitude)
     (strain,) = doubts_of_solution(found, 300.0)
@@ -194,7 +199,7 @@ def test_the_word_follows_from_the_doubts_and_survives_the_file(tmp_path):
     assert read.verdict.names == ("a-b", "c")
     assert read.verdict.of_step(7) == ("a-b",)
     assert read.verdict.of_step(8) == ()
-    assert [stage.stop for stage in read.stages] == [stage.stop for stage in found.stages]
+    assert [stage.stop for stage in read.fit.stages] == [stage.stop for stage in found.fit.stages]
 
 
 def test_what_fails_is_told_with_the_doubts_before():

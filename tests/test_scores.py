@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,8 +36,8 @@ def test_a_perfect_measurement_has_no_error_at_8_percent_strain_and_15_voxels():
 
 def test_reading_the_field_at_the_reference_position_would_cost_over_a_voxel():
     truth, measurement = tensile()
-    step = len(measurement.angle_rad) - 1
-    at_reference = measurement.displacement(step, truth.point_mm) - truth.displacement_mm[step] / VOXEL
+    step = len(measurement.recording.angle_rad) - 1
+    at_reference = measurement.motion.displacement(step, truth.point_mm) - truth.displacement_mm[step] / VOXEL
     used = np.isfinite(point_errors(measurement, truth).components[step]).all(axis=1)
     # u(X) - U(X) = -(e / (1 + e)) U_z: 8 % of up to 15 + 0.08 * 336 voxels
     expected = -0.08 / 1.08 * truth.displacement_mm[step, used, 2] / VOXEL
@@ -144,13 +143,13 @@ def test_without_truth_the_sections_themselves_are_followed():
     _, measurement = tensile()
     centre = centre_line(measurement)
     assert centre.true is None
-    np.testing.assert_allclose(centre.measured[..., 2], measurement.amplitude[..., 2])
+    np.testing.assert_allclose(centre.measured[..., 2], measurement.motion.amplitude[..., 2])
     assert centre.stretch(centre.measured).mean(axis=1) == pytest.approx(0, abs=1e-9)
 
 
 def test_json_has_the_promised_keys_and_null_for_what_is_unknown():
     truth, measurement = tensile()
-    measurement = replace(measurement, snr_noise_db=np.full(records.STEPS, np.nan))
+    measurement = records.altered(measurement, snr_noise_db=np.full(records.STEPS, np.nan))
     values = json.loads(score(measurement, truth, scenario="quick", simulate_s=3.0).to_json())
     assert values["scenario"] == "quick"
     assert values["steps"] == records.STEPS

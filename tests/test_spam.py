@@ -12,7 +12,7 @@ import tifffile
 from scipy import ndimage
 
 from pdvc.experiment import read_experiment
-from pdvc.measurement import read_measurement, write_measurement
+from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.sections import SectionBasis
 from pdvc.volume import Grid, Volume, hull_of
 from simulator.scanner import simulate
@@ -219,17 +219,17 @@ def test_the_method_measures_the_scans_that_spam_finds(held, tmp_path, monkeypat
     method = find_method("spam")
     assert method.looks_at == "volumes"
     measurement = method.function(read_experiment(held))
-    assert "step 12: 405 of 500 nodes converged" in measurement.stages[0].stop_reason
-    assert "step 24: spam-reg did not converge" in measurement.stages[0].stop_reason
+    assert "step 12: 405 of 500 nodes converged" in measurement.fit.stages[0].stop_reason
+    assert "step 24: spam-reg did not converge" in measurement.fit.stages[0].stop_reason
     assert {spacing for _, _, spacing in asked} == {3}  # half the distance of two sections
-    known = np.isfinite(measurement.amplitude[:, measurement.observed]).all(axis=(1, 2))
+    known = np.isfinite(measurement.motion.amplitude[:, measurement.motion.observed]).all(axis=(1, 2))
     np.testing.assert_array_equal(np.flatnonzero(known), [12])
     scores = score(measurement, truth)
     for name in ("across_beam", "vertical", "along_beam"):
         # 15 sections between which the truth bends a little
         assert getattr(scores.error_voxel, name) < 0.01
     write_measurement(measurement, tmp_path / "m.nc")
-    np.testing.assert_array_equal(read_measurement(tmp_path / "m.nc").amplitude, measurement.amplitude)
+    np.testing.assert_array_equal(read_measurement(tmp_path / "m.nc").amplitude, measurement.motion.amplitude)
 
 
 def test_where_spam_finds_nothing_the_method_says_so(held, monkeypatch, programs):

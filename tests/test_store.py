@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, get_args
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from pdvc.digest import digest
 from pdvc.experiment import Experiment, InterruptedScan, Series
 from pdvc.geometry import ConeBeam
-from pdvc.history import TimeFunctions
+from pdvc.history import TimeFunction
 from pdvc.measure import measure
 from pdvc.options import MeasureOptions
 from pdvc.settings import Settings
@@ -58,8 +59,7 @@ def experiment() -> Experiment:
 
 def every_options() -> MeasureOptions:
     """Return options in which every kind of time function occurs."""
-    kinds = get_args(get_args(TimeFunctions)[0])
-    return MeasureOptions(time=tuple(kind() for kind in kinds))
+    return MeasureOptions(time=tuple(kind() for kind in TimeFunction.kinds()))
 
 
 Path = tuple[str | int, ...]
@@ -255,8 +255,8 @@ def test_a_folder_that_was_used_before_gives_what_a_new_one_does(used_before, tm
     work, here, options = used_before
     other = CHANGES[change](here)
     kept, fresh = measure(other, options, work=work), measure(other, options, work=tmp_path)
-    for name in ("amplitude", "amplitude_std", "residual_final"):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(fresh, name))
+    for name in ("motion.amplitude", "motion.amplitude_std", "fit.residual_final"):
+        np.testing.assert_array_equal(attrgetter(name)(kept), attrgetter(name)(fresh))
 
 
 def test_the_same_experiment_is_measured_from_what_was_kept(used_before):

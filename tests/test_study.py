@@ -93,7 +93,7 @@ class TestDesigns:
         for trial in found:
             assert trial.scenario.detector.photons_per_pixel == trial.factors["photons_per_pixel"]
             assert trial.options.sections == trial.factors["sections"]
-            assert trial.options.rigid[0].solver == "gauss-newton"
+            assert trial.options.rigid[0].solver.kind == "gauss-newton"
             assert trial.scenario.geometry.rows == 60
         assert len({trial.key for trial in found}) == 8
 

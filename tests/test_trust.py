@@ -83,7 +83,7 @@ def test_the_distance_of_the_true_motion_from_the_space_is_told(case):
 def test_contraction_is_no_cause_where_only_other_directions_are_wrong_or_volumes_were_compared(case):
     measurement, truth, scores = case
     assert "contraction" not in calibration_sentences(measurement, with_z(scores, 2, 2, 1, 1), truth)[0]
-    volumes = replace(measurement, residual_final=np.zeros((records.STEPS, 0, 0), np.float32))
+    volumes = records.altered(measurement, residual_final=np.zeros((records.STEPS, 0, 0), np.float32))
     assert "contraction" not in calibration_sentences(volumes, with_z(scores, 2, 2, 2, 1), truth)[0]
 
 
@@ -129,7 +129,7 @@ def test_residuals_that_pass_and_that_do_not(changed, first, last):
 def test_a_noise_taken_from_the_residual_is_not_tested_by_it(case):
     measurement, _, _ = case
     assert noise_known(measurement)
-    assert not noise_known(replace(measurement, snr_noise_db=np.full(records.STEPS, np.nan)))
+    assert not noise_known(records.altered(measurement, snr_noise_db=np.full(records.STEPS, np.nan)))
     wrong = replace(AS_NOISE, chi2_reduced=0.7)
     size, _, conclusion = residual_sentences(wrong, noise_known=False, truth_known=False)
     assert "tells nothing" in size
@@ -144,7 +144,7 @@ def test_volumes_were_not_tested():
 
 def test_a_page_without_truth_has_no_table_but_the_sentences(tmp_path, case):
     measurement, _, _ = case
-    text = write_report(tmp_path, replace(measurement, residual_tests=AS_NOISE)).read_text()
+    text = write_report(tmp_path, records.altered(measurement, residual_tests=AS_NOISE)).read_text()
     assert 'id="trust"' not in text
     verdict = text.partition('<ul id="deviations">')[2].partition("</ul>")[0]
     assert verdict.count("<li>") == 3

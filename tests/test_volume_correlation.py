@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pdvc.experiment import InterruptedScan
-from pdvc.measurement import read_measurement, write_measurement
+from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.volume_correlation import correlate
 from validation.report.page import write_report
 from validation.scoring.scores import point_errors, score
@@ -36,7 +36,7 @@ def test_the_motion_at_the_held_steps_is_found_in_all_directions(measured):
     assert np.flatnonzero(np.isfinite(by_step).all(axis=1)).tolist() == list(HELD)
     # nodules and walls are a few voxels here; what is found is some hundredths of a voxel, along the beam too
     assert by_step[list(HELD)].max() < 0.1
-    moved = np.abs(CASE.truth.displacement_mm[list(HELD)]).max(axis=(1, 2)) / measured.voxel_mm
+    moved = np.abs(CASE.truth.displacement_mm[list(HELD)]).max(axis=(1, 2)) / measured.recording.voxel_mm
     assert moved.min() > 1
 
 
@@ -45,12 +45,14 @@ def test_errors_are_of_the_size_of_the_standard_deviations(measured):
     z = []
     for step in HELD:
         points = CASE.truth.point_mm + CASE.truth.displacement_mm[step]
-        inside = (points[:, 2] >= measured.basis.height_mm[0]) & (points[:, 2] <= measured.basis.height_mm[-1])
-        points, true = points[inside], CASE.truth.displacement_mm[step][inside] / measured.voxel_mm
-        unit = np.eye(np.prod(measured.basis.shape)).reshape(-1, *measured.basis.shape)
-        moves = np.stack([measured.basis.displacement(each, points).ravel() for each in unit], axis=1)
-        best = np.linalg.lstsq(moves, true.ravel(), rcond=None)[0].reshape(measured.basis.shape)
-        z.append((measured.amplitude[step] - best) / measured.amplitude_std[step])
+        inside = (points[:, 2] >= measured.motion.basis.height_mm[0]) & (
+            points[:, 2] <= measured.motion.basis.height_mm[-1]
+        )
+        points, true = points[inside], CASE.truth.displacement_mm[step][inside] / measured.recording.voxel_mm
+        unit = np.eye(np.prod(measured.motion.basis.shape)).reshape(-1, *measured.motion.basis.shape)
+        moves = np.stack([measured.motion.basis.displacement(each, points).ravel() for each in unit], axis=1)
+        best = np.linalg.lstsq(moves, true.ravel(), rcond=None)[0].reshape(measured.motion.basis.shape)
+        z.append((measured.motion.amplitude[step] - best) / measured.motion.amplitude_std[step])
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 3
 
 
@@ -61,23 +63,25 @@ def test_the_record_tells_which_steps_were_scanned(measured):
         known = np.isfinite(getattr(measured, name)).reshape(18, -1)
         np.testing.assert_array_equal(known, np.broadcast_to(held[:, None], known.shape), err_msg=name)
     points = np.zeros((4, 3))
-    points[:, 2] = measured.basis.height_mm
+    points[:, 2] = measured.motion.basis.height_mm
     for step in range(18):
         told = np.concatenate([measured.turned_std(step, points).ravel(), measured.strain_std(step, points[:, 2])])
         assert np.isfinite(told).all() if held[step] else np.isnan(told).all()
         assert not (told <= 0).any()
     # at the height of a section its translations alone move the axis
-    np.testing.assert_allclose(measured.turned_std(12, points)[:, 1], measured.amplitude_std[12, :, 2])
-    np.testing.assert_allclose(measured.time_functions @ measured.time_functions.T / 18, np.eye(3), atol=1e-12)
-    np.testing.assert_array_equal(measured.time_functions.argmax(axis=1), HELD)
-    assert measured.observed.all()
-    assert measured.data_share[list(HELD)].min() > 0.9
-    assert (measured.snr_final_db > measured.snr_rigid_db)[list(HELD)].all()
-    assert [(stage.name, stage.scale, stage.unknowns) for stage in measured.stages] == [
+    np.testing.assert_allclose(measured.turned_std(12, points)[:, 1], measured.motion.amplitude_std[12, :, 2])
+    np.testing.assert_allclose(
+        measured.motion.time_functions @ measured.motion.time_functions.T / 18, np.eye(3), atol=1e-12
+    )
+    np.testing.assert_array_equal(measured.motion.time_functions.argmax(axis=1), HELD)
+    assert measured.motion.observed.all()
+    assert measured.motion.data_share[list(HELD)].min() > 0.9
+    assert (measured.fit.snr_final_db > measured.fit.snr_rigid_db)[list(HELD)].all()
+    assert [(stage.name, stage.scale, stage.unknowns) for stage in measured.fit.stages] == [
         ("rigid", 1, 18),
         ("deformation", 1, 72),
     ]
-    for stage in measured.stages:
+    for stage in measured.fit.stages:
         assert stage.rms[1] < stage.rms[0]
         assert all(f"step {step}: converged" in stage.stop_reason for step in HELD)
 
@@ -86,24 +90,24 @@ def test_what_was_kept_is_found_again_to_the_bit(measured, work):
     tasks = []
     again = correlate(CASE.experiment, OPTIONS, work=work, progress=lambda task, *_: tasks.append(task))
     assert not [task for task in tasks if "pass" in task or "reconstruct" in task]
-    assert again.seconds["measure"] == measured.seconds["measure"]
-    np.testing.assert_array_equal(again.amplitude, measured.amplitude)
-    np.testing.assert_array_equal(again.amplitude_std, measured.amplitude_std)
+    assert again.provenance.seconds["measure"] == measured.provenance.seconds["measure"]
+    np.testing.assert_array_equal(again.motion.amplitude, measured.motion.amplitude)
+    np.testing.assert_array_equal(again.motion.amplitude_std, measured.motion.amplitude_std)
 
 
 def test_a_scan_is_measured_alike_whatever_else_was_scanned(measured):
     alone = correlate(with_scans(CASE.experiment.interrupted[1]), OPTIONS)
-    np.testing.assert_array_equal(alone.amplitude[12], measured.amplitude[12])
-    assert np.isnan(alone.amplitude[[0, 17]]).all()
+    np.testing.assert_array_equal(alone.motion.amplitude[12], measured.motion.amplitude[12])
+    assert np.isnan(alone.motion.amplitude[[0, 17]]).all()
 
 
 def test_the_reference_scan_repeated_has_not_moved():
     """Other noise than that of the reference scan, and no motion."""
     still = SmallExperiment(small_scenario({"interrupted.steps": (4,), "motion.ingredients": ()}))
     found = correlate(still.experiment, OPTIONS)
-    z = found.amplitude[4] / found.amplitude_std[4]
+    z = found.motion.amplitude[4] / found.motion.amplitude_std[4]
     assert 0.3 < np.sqrt(np.mean(z**2)) < 2
-    assert np.abs(found.amplitude[4, :, :3]).max() < 0.1
+    assert np.abs(found.motion.amplitude[4, :, :3]).max() < 0.1
 
 
 def test_a_measurement_with_unscanned_steps_is_written_read_scored_and_reported(measured, tmp_path):

@@ -6,6 +6,7 @@ import tomllib
 from typing import Any
 
 from pdvc.options import MeasureOptions, StageOptions
+from pdvc.pgd import Pgd
 from simulator.scenario import Scenario
 from validation.batch.trial import Trial
 
@@ -37,7 +38,10 @@ stroke_mm_per_s = 0.01
 """
 """An experiment of 119 x 54 px that is simulated and measured in a few seconds."""
 
-FAST = {"rigid": (StageOptions(scale="coarse", most=2),), "deformation": (StageOptions(scale=1, most=2),)}
+FAST = {
+    "rigid": (StageOptions(scale="coarse", solver=Pgd(most_modes=2)),),
+    "deformation": (StageOptions(scale=1, solver=Pgd(most_modes=2)),),
+}
 
 
 def trial(options: dict[str, Any] | None = None, **changes: Any) -> Trial:

@@ -137,8 +137,8 @@ def _say(console: Console, text: str) -> None:
 
 def used(measurement: Measurement) -> str:
     """Return in one line which part of the radiographs was used, and where loading begins."""
-    top, bottom, left, right = measurement.window
-    starts = re.findall(r"^start = (\d+)", measurement.options, re.MULTILINE)
+    top, bottom, left, right = measurement.recording.window
+    starts = re.findall(r"^start = (\d+)", measurement.provenance.options, re.MULTILINE)
     onset = f"; loading begins after step {', '.join(dict.fromkeys(starts))}" if starts else ""
     return f"used: rows {top} to {bottom - 1}, columns {left} to {right - 1}{onset}"
 

@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING
 from pdvc.digest import digest
 from pdvc.experiment import DESCRIPTION, Experiment, read_experiment
 from pdvc.lock import held
-from pdvc.measurement import Measurement, MeasurementError, read_measurement, write_measurement
+from pdvc.measurement import Measurement, MeasurementError
+from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.progress import Progress, silent
 from pdvc.store import experiment_digest
 from pdvc.whole import write_whole

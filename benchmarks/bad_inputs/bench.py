@@ -21,7 +21,8 @@ import numpy as np
 
 from benchmarks.bad_inputs.experiments import EXPERIMENTS
 from benchmarks.bad_inputs.record import BadInput, Folder
-from pdvc.measurement import Measurement, MeasurementError, read_measurement
+from pdvc.measurement import Measurement, MeasurementError
+from pdvc.measurement_file import read_measurement
 from simulator.scanner import simulate
 from validation.scoring.centre_line import centre_line
 

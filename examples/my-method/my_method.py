@@ -1,4 +1,4 @@
-"""A method of one's own: a function from an Experiment to a Measurement, announced in pyproject.toml beside it."""
+"""A method of one's own: a record with a function from an Experiment to a Measurement, announced in pyproject.toml."""
 
 from dataclasses import replace
 
@@ -9,15 +9,23 @@ from pdvc.history import Force, Polynomial
 from pdvc.measure import measure
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions
+from validation.methods.registry import Method
 
 
 def follows_force(experiment: Experiment) -> Measurement:
-    """Assume that the sample moves in proportion to the force, and by a shift before the test, but not with the stage.
+    """Measure with the force, freed of its noise by a median over five steps, and a constant as time functions.
 
-    Pages of `pdvc-bench compare` print the paragraph above. Anything that takes an Experiment and fills in a
-    Measurement is a method; this one leaves most to `measure`, and hands it a force freed of its noise, by a median
-    over five steps.
+    Anything that takes an Experiment and fills in a Measurement is a method; this one leaves most to `measure`.
     """
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(experiment.test.force_N, 2, mode="edge"), 5)
     quiet = replace(experiment, test=replace(experiment.test, force_N=np.median(windows, axis=1)))
     return measure(quiet, MeasureOptions(time=(Force(), Polynomial(degree=0)), sections=6))
+
+
+FOLLOWS_FORCE = Method(
+    name="follows-force",
+    measure=follows_force,
+    # pages of `pdvc-bench compare` print this
+    assumes="Assume that the sample moves in proportion to the force, and by a shift before the test, but not with "
+    "the stage.",
+)

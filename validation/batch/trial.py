@@ -31,11 +31,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.deviations import Quantities
 from pdvc.digest import digest, software
 from pdvc.experiment import Experiment, read_experiment
 from pdvc.measure import measure
 from pdvc.measurement import Measurement
-from pdvc.options import MeasureOptions, resolved
+from pdvc.options import MeasureOptions
 from pdvc.preparation import keep_volumes, volume_choices
 from simulator.clean import clean_file, clean_stack
 from simulator.scanner import simulate
@@ -45,7 +46,6 @@ from simulator.views import Stack, stacks_of
 from validation.batch.engine import Part, Result, Scalar
 from validation.scoring.bound import kept_bound
 from validation.scoring.centre_line import centre_line
-from validation.scoring.interval_calibration import Quantities
 from validation.scoring.scores import Scores, point_errors, score
 
 CLEAN = "clean"
@@ -138,12 +138,11 @@ class Volumes:
     def name(self) -> str:
         """Return their folder in the shared folder: a digest of the counts' origin, and of the options that matter."""
         scenario = self.scenario
-        options = resolved(self.options, scenario.geometry.cone_beam())
         key = digest(
             clean_file(scenario, Stack("reference")),
             scenario.detector,
             (scenario.repetition, scenario.loading.plateau_N, scenario.acquisition.force_noise_N),
-            volume_choices(options),
+            volume_choices(self.options, scenario.geometry.cone_beam()),
         )
         return f"volumes-{key}"
 

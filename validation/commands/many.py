@@ -9,7 +9,6 @@ import typer
 
 from validation.commands.parts import (
     Options,
-    ScenarioName,
     Scheduler,
     Threads,
     Workers,
@@ -139,7 +138,13 @@ def study(
 
 
 def plan(
-    scenario: ScenarioName,
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO|DIR",
+            help="A built-in name or TOML file, or an experiment folder with a reference scan and a planned test.",
+        ),
+    ],
     options: Options = "default",
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="CSV", help="Write the designs here, too, as a table.")
@@ -148,26 +153,40 @@ def plan(
 ) -> None:
     """Tell what to expect of a test before it is made, and which motions it would not show.
 
-    From the reference scan's sensitivities alone: the standard deviations of the scenario as it is, and with other
+    From the reference scan's sensitivities alone: the standard deviations of the test as it is, and with other
     numbers of radiographs a turn, turns, frames, flats and sections. They hold noise and prior, not model errors.
+
+    The reference scan is simulated, or that of an experiment folder whose test/radiographs.tif need not be there:
+    then `test` in experiment.toml says which angles, times and forces are planned.
 
     Example:  `pdvc-bench plan quick`
     """
     with answering() as progress:
-        from simulator.scenario import load_scenario
         from validation.job import write_text
-        from validation.plan.plan import plan as work_out
+        from validation.plan.designs import plan as work_out
+        from validation.plan.designs import plan_experiment
         from validation.plan.tables import designs_csv, designs_table, weak_table
 
-        chosen, read = load_scenario(scenario), read_options(options)
-        use_threads(threads)
-        found = work_out(chosen, read, progress=progress)
+        read = read_options(options)
+        folder = Path(scenario)
+        if folder.is_dir():
+            from pdvc.experiment import read_experiment
+
+            experiment = read_experiment(folder, planned=True)
+            use_threads(threads)
+            name, found = experiment.title or str(folder), plan_experiment(experiment, read, progress=progress)
+        else:
+            from simulator.scenario import load_scenario
+
+            chosen = load_scenario(scenario)
+            use_threads(threads)
+            name, found = chosen.name, work_out(chosen, read, progress=progress)
         if out is not None:
             write_text(out, designs_csv(found))
     from rich.console import Console
 
     console = Console()
-    console.print(designs_table(found, chosen))
+    console.print(designs_table(found, name))
     console.print(weak_table(found))
     if out is not None:
         tell(f"table: {out}")

@@ -157,7 +157,7 @@ def score(
     Example:  `pdvc-bench score motion.nc --truth out/quick/experiment`
     """
     with answering():
-        from pdvc.measurement import read_measurement
+        from pdvc.measurement_file import read_measurement
         from validation.job import write_text
         from validation.scoring.scores import score as compare
 
@@ -188,7 +188,7 @@ def report(
     """
     with answering():
         from pdvc.experiment import read_experiment
-        from pdvc.measurement import read_measurement
+        from pdvc.measurement_file import read_measurement
         from validation.report.page import write_report
         from validation.scoring.scores import score as compare
 

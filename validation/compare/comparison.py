@@ -94,7 +94,7 @@ class MethodRun:
         method = find_method(self.method)
         with simulated(self.scenario, shared) as (experiment, truth, simulate_s):
             started = time.perf_counter()
-            measurement = method.function(experiment)
+            measurement = method.measure(experiment)
             took = time.perf_counter() - started
             if not isinstance(measurement, Measurement):
                 raise ValueError(
@@ -109,7 +109,7 @@ class MethodRun:
                 "steps_measured": int(errors.steps.sum()),
                 **costs,
                 # compiling happens once for each process, whichever method comes first
-                "seconds_method": took - measurement.seconds.get("compile", 0.0),
+                "seconds_method": took - measurement.provenance.seconds.get("compile", 0.0),
             },
             arrays={"points": errors.points, "strain": errors.strain},
         )
@@ -129,7 +129,7 @@ def _costs(experiment: Experiment, looks_at: LooksAt) -> dict[str, Scalar]:
 def _source(method: Method) -> str:
     """Return the text of the file that holds a method: a method that is being worked on is run anew."""
     try:
-        path = inspect.getsourcefile(inspect.unwrap(method.function))
+        path = inspect.getsourcefile(inspect.unwrap(method.measure))
     except TypeError:
         path = None
     return Path(path).read_text(encoding="utf-8") if path and Path(path).is_file() else ""

@@ -1,7 +1,7 @@
-"""Methods: named functions from an experiment to a measurement, found through the entry points of installed packages.
+"""Methods: named ways from an experiment to a measurement, found through the entry points of installed packages.
 
 A package adds a method by an entry point of the group `pdvc_bench.methods`; the methods below are found in the same
-way. The first paragraph of a method's docstring says what it assumes: reports print it.
+way. What an entry point names is a `Method`.
 """
 
 from __future__ import annotations
@@ -28,35 +28,25 @@ LooksAt = Literal["projections", "volumes"]
 
 
 class MethodError(ValueError):
-    """Say which method is unknown or cannot be used, and what to do."""
+    """A method is unknown or cannot be used: which, and what to do."""
+
+
+def _always() -> None:
+    """Raise nothing: a method that needs nothing besides our own installation can always be used."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """Hold a method under the name by which it is asked for."""
+    """A way to measure an experiment, under the name by which it is asked for."""
 
     name: str
-    function: Callable[[Experiment], Measurement]
-
-    @property
-    def assumes(self) -> str:
-        """Return the first paragraph of the function's docstring, in one line."""
-        return " ".join((self.function.__doc__ or "").strip().partition("\n\n")[0].split())
-
-    def check(self) -> None:
-        """Raise what the function's own `check` raises, where it has one: why it cannot be used here."""
-        getattr(self.function, "check", lambda: None)()
-
-    @property
-    def looks_at(self) -> LooksAt:
-        """Return what the method uses of an experiment, which is what it costs on the machine."""
-        return getattr(self.function, "looks_at", "projections")
-
-
-def looks_at_volumes(function: Callable[[Experiment], Measurement]) -> Callable[[Experiment], Measurement]:
-    """Mark a method that uses the interrupted scans in place of the radiographs of the test."""
-    function.looks_at = "volumes"  # type: ignore[attr-defined]
-    return function
+    measure: Callable[[Experiment], Measurement]
+    assumes: str
+    """What it assumes, in a few sentences: reports print it."""
+    looks_at: LooksAt = "projections"
+    """What it uses of an experiment, which is what it costs on the machine."""
+    check: Callable[[], None] = _always
+    """Raises MethodError where the method cannot be used here, and says what to do."""
 
 
 def method_names() -> tuple[str, ...]:
@@ -83,18 +73,17 @@ def find_method(name: str) -> Method:
         raise MethodError(f"method {name!r}: expected one package to offer it, found several: {owners}")
     (entry,) = found
     try:
-        function = entry.load()
+        method = entry.load()
     except (ImportError, AttributeError) as error:
         raise MethodError(
             f"method {name!r}: expected {entry.value} of {_owner(entry)}, cannot load it: {error}"
         ) from None
-    if not callable(function):
-        raise MethodError(f"method {name!r}: expected a function at {entry.value}, found {type(function).__name__}")
-    method = Method(name=name, function=function)
-    if not method.assumes:
-        raise MethodError(
-            f"method {name!r}: expected a docstring at {entry.value} that says what the method assumes, found none"
-        )
+    if not isinstance(method, Method):
+        raise MethodError(f"method {name!r}: expected a Method at {entry.value}, found {type(method).__name__}")
+    if method.name != name:
+        raise MethodError(f"method {name!r}: expected a Method of this name at {entry.value}, found {method.name!r}")
+    if not method.assumes.strip():
+        raise MethodError(f"method {name!r}: expected {entry.value} to say what the method assumes, it does not")
     return method
 
 

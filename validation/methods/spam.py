@@ -33,18 +33,17 @@ from numpy.typing import NDArray
 from pdvc.experiment import Experiment
 from pdvc.history import Steps, time_basis
 from pdvc.measure import versions
-from pdvc.measurement import Measurement, Stage
-from pdvc.options import MeasureOptions, resolved
-from pdvc.preparation import bases, calibrated, outlined, scan_volume
+from pdvc.measurement import MeasuredMotion, Measurement, Provenance, Stage, unfitted
+from pdvc.options import MeasureOptions
+from pdvc.preparation import scan_volume
 from pdvc.prior import solved
 from pdvc.progress import silent
 from pdvc.radiographs import IDENTITY
 from pdvc.sections import SectionBasis
-from pdvc.store import Store
+from pdvc.setup import Setup, outlined, set_up
 from pdvc.verdict import Stop
 from pdvc.volume import Grid, Volume
-from pdvc.window import used_window
-from validation.methods.registry import MethodError, looks_at_volumes
+from validation.methods.registry import Method, MethodError
 
 Floats = NDArray[np.float64]
 
@@ -92,10 +91,8 @@ def program(name: str) -> Path:
     return Path(found)
 
 
-@looks_at_volumes
-def spam(experiment: Experiment) -> Measurement:
-    """Assume windows of 21 voxels that each deform affinely, and a sample that stands still at some steps for as long
-    as a full scan takes, without creep. Our sections are fitted to the nodes of spam's local correlation afterwards.
+def correlate_by_spam(experiment: Experiment) -> Measurement:
+    """Correlate the interrupted scans with the reference scan by spam, and fit our sections to what it finds.
 
     Raises ValueError, in one line, where there is no scan, and MethodError where spam is not installed.
     """
@@ -103,8 +100,9 @@ def spam(experiment: Experiment) -> Measurement:
     if not experiment.interrupted:
         raise ValueError("interrupted scans: expected at least one, found none: spam compares full scans")
     started = time.perf_counter()
-    options = resolved(MeasureOptions(), experiment.geometry)
-    reference, volumes, window, basis = _volumes(experiment, options)
+    setup = set_up(experiment, MeasureOptions())
+    basis = setup.sections
+    reference, volumes = _volumes(setup)
     correlating = time.perf_counter()
     spacing_mm = float(np.diff(basis.height_mm).min())
     spacing = min(SPACING_VOXEL, max(int(spacing_mm / reference.grid.voxel_mm / 2), 1))
@@ -117,7 +115,7 @@ def spam(experiment: Experiment) -> Measurement:
             if nodes is None:
                 told.append(f"step {scan.step}: spam-reg did not converge")
                 continue
-            found, seen, rms = fitted(basis, nodes, experiment.geometry.voxel_mm, options.prior_voxel)
+            found, seen, rms = fitted(basis, nodes, setup.geometry.voxel_mm, setup.options.prior_voxel)
             told.append(
                 f"step {scan.step}: {len(nodes.point_mm)} of {nodes.tried} nodes converged; the sections fit "
                 f"them to {rms:.2g} voxel rms"
@@ -128,73 +126,61 @@ def spam(experiment: Experiment) -> Measurement:
     if not steps:
         raise ValueError(f"spam: expected at least one scan that can be correlated, found none: {'; '.join(told)}")
     amplitude[:, ~observed] = np.nan
-    unknown = np.full(len(experiment.test), np.nan)
-    nothing = np.zeros((len(experiment.test), 0, 0), dtype=np.float32)
     size = basis.shape[0] * basis.shape[1]
+    stage = Stage(
+        name="deformation",
+        scale=1,
+        solver="spam-ldic",
+        unknowns=len(steps) * size,
+        temporal=np.empty((0, len(amplitude))),
+        spatial=np.empty((0, *basis.shape)),
+        rms=np.empty(0),
+        stop=Stop.UNFINISHED if any("did not converge" in each for each in told) else Stop.CONVERGED,
+        stop_reason="; ".join(told),
+    )
     return Measurement(
-        title=experiment.title,
-        voxel_mm=experiment.geometry.voxel_mm,
-        source_axis_mm=experiment.geometry.source_axis_mm,
-        angle_rad=experiment.test.angle_rad,
-        time_s=experiment.test.time_s,
-        force_N=experiment.test.force_N,
-        window=window,
-        basis=basis,
-        time_functions=time_basis((Steps(),), experiment.test)[steps],
-        amplitude=amplitude,
-        # spam tells no uncertainty
-        covariance=np.full((len(steps), size, size), np.nan),
-        amplitude_std=np.full_like(amplitude, np.nan),
-        data_share=np.full_like(amplitude, np.nan),
-        observed=observed,
-        stages=(
-            Stage(
-                name="deformation",
-                scale=1,
-                solver="spam-ldic",
-                unknowns=len(steps) * size,
-                temporal=np.empty((0, len(unknown))),
-                spatial=np.empty((0, *basis.shape)),
-                rms=np.empty(0),
-                stop=Stop.UNFINISHED if any("did not converge" in each for each in told) else Stop.CONVERGED,
-                stop_reason="; ".join(told),
-            ),
+        recording=setup.recording(),
+        motion=MeasuredMotion(
+            basis=basis,
+            time_functions=time_basis((Steps(),), experiment.test)[steps],
+            amplitude=amplitude,
+            # spam tells no uncertainty
+            covariance=np.full((len(steps), size, size), np.nan),
+            amplitude_std=np.full_like(amplitude, np.nan),
+            data_share=np.full_like(amplitude, np.nan),
+            observed=observed,
         ),
-        snr_reprojection_db=np.empty(0),
-        snr_initial_db=unknown,
-        snr_rigid_db=unknown,
-        snr_final_db=unknown,
-        snr_noise_db=unknown,
-        residual_initial=nothing,
-        residual_rigid=nothing,
-        residual_final=nothing,
-        seconds={"reconstruct": correlating - started, "measure": time.perf_counter() - correlating},
-        options=options.template(),
-        versions=f"{versions()}, spam {_version()}",
+        fit=unfitted((stage,), len(amplitude)),
+        provenance=Provenance(
+            seconds={"reconstruct": correlating - started, "measure": time.perf_counter() - correlating},
+            options=setup.options.template(),
+            versions=f"{versions()}, spam {_version()}",
+        ),
     )
 
 
-spam.check = check  # type: ignore[attr-defined]
+SPAM = Method(
+    name="spam",
+    measure=correlate_by_spam,
+    assumes="Assume windows of 21 voxels that each deform affinely, and a sample that stands still at some steps for "
+    "as long as a full scan takes, without creep. Our sections are fitted to the nodes of spam's local correlation "
+    "afterwards.",
+    looks_at="volumes",
+    check=check,
+)
 
 
-def _volumes(
-    experiment: Experiment, options: MeasureOptions
-) -> tuple[Volume, list[Volume], tuple[int, int, int, int], SectionBasis]:
-    """Return the volumes of the reference and the interrupted scans, the used window and the sections.
-
-    All are those that `classical-dvc` has.
-    """
-    geometry, store = experiment.geometry, Store(None, experiment)
-    calibration, outline = calibrated(experiment, options, store, silent)
+def _volumes(setup: Setup) -> tuple[Volume, list[Volume]]:
+    """Return the volumes of the reference and the interrupted scans, those that `classical-dvc` has."""
+    experiment, geometry, calibration = setup.experiment, setup.geometry, setup.calibration
     plain, polynomial = calibration.with_polynomial(IDENTITY), calibration.polynomial
-
-    reference = scan_volume(experiment.reference, geometry, calibration, outline.hull, 1, 0.0, _made, silent)
+    hull = setup.outline.hull
+    reference = scan_volume(experiment.reference, geometry, calibration, hull, 1, 0.0, _made, silent)
     volumes = []
     for scan in experiment.interrupted:
         hull = outlined(scan.series, geometry, plain, polynomial, _made, silent).hull
         volumes.append(scan_volume(scan.series, geometry, calibration, hull, 1, 0.0, _made, silent))
-    window = used_window(geometry, options, outline.hull)
-    return reference, volumes, window, bases(geometry, window, outline.hull, options)[1]
+    return reference, volumes
 
 
 def _made(make):  # type: ignore[no-untyped-def]

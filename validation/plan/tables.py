@@ -8,8 +8,7 @@ from dataclasses import asdict
 
 from rich.table import Table
 
-from simulator.scenario import Scenario
-from validation.plan.plan import INVISIBLE_VOXEL, Expected, Plan
+from validation.plan.designs import INVISIBLE_VOXEL, Expected, Plan
 
 _QUANTITIES = ("across_beam", "vertical", "along_beam", "strain")
 
@@ -26,11 +25,11 @@ def designs_csv(plan: Plan) -> str:
     return text.getvalue()
 
 
-def designs_table(plan: Plan, scenario: Scenario) -> Table:
-    """Return the designs with their expected standard deviations; what differs from the scenario's own is bold."""
+def designs_table(plan: Plan, name: str) -> Table:
+    """Return the designs with their expected standard deviations; what differs from the first is bold."""
     table = Table(
-        title=f"{scenario.name}: expected standard deviations",
-        caption="Noise and prior, not errors of the model. First line: the scenario as it is.",
+        title=f"{name}: expected standard deviations",
+        caption="Noise and prior, not errors of the model. First line: the test as it is.",
     )
     for heading in ("a turn", "turns", "steps", "frames", "flats", "sections"):
         table.add_column(heading, justify="right")

@@ -81,29 +81,29 @@ def _page(
         lstrip_blocks=True,
     )
     return environment.get_template("report.html").render(
-        title=scores.scenario if scores else measurement.title,
+        title=scores.scenario if scores else measurement.recording.title,
         m=measurement,
         volumes=of_volumes(measurement),
-        measured=int(np.isfinite(measurement.amplitude).any(axis=(1, 2)).sum()),
+        measured=int(np.isfinite(measurement.motion.amplitude).any(axis=(1, 2)).sum()),
         scores=scores,
         verdict=measurement.verdict,
         listed=listed,
         believed=BELIEVED[measurement.verdict.word],
         rows=summary_rows(measurement, scores),
-        errors=_error_table(scores, measurement.voxel_mm * 1e3) if scores else [],
+        errors=_error_table(scores, measurement.recording.voxel_mm * 1e3) if scores else [],
         trust=trust_table(scores) if scores else [],
         nees=nees_sentence(scores.calibration) if scores else "",
         calibration=calibration_sentences(measurement, scores, truth) if scores else [],
         residual=residual_sentences(
-            measurement.residual_tests, noise_known=noise_known(measurement), truth_known=scores is not None
+            measurement.fit.residual_tests, noise_known=noise_known(measurement), truth_known=scores is not None
         ),
         pictures=shown,
         floor=floor,
         floor_lines=_floor_table(floor, scores) if floor else [],
         least_steps=LEAST_STEPS,
         motions=_observability(measurement),
-        unobserved=[f"{z:.2f}" for z in measurement.basis.height_mm[~measurement.observed]],
-        voxel_um=f"{measurement.voxel_mm * 1e3:.2f}",
+        unobserved=[f"{z:.2f}" for z in measurement.motion.basis.height_mm[~measurement.motion.observed]],
+        voxel_um=f"{measurement.recording.voxel_mm * 1e3:.2f}",
     )
 
 
@@ -120,8 +120,8 @@ def summary_rows(measurement: Measurement, scores: Scores | None) -> list[Row]:
         Row(name="SNR that noise alone would leave, dB", here=_number(snr.noise_limit, 2)),
         Row(name="rigid modes", here=str(modes.rigid), paper="8"),
         Row(name="deformation modes", here=str(modes.deformation), paper="4"),
-        Row(name="steps", here=str(len(measurement.angle_rad)), paper="127"),
-        Row(name="unknowns", here=str(measurement.unknowns), paper="630"),
+        Row(name="steps", here=str(len(measurement.recording.angle_rad)), paper="127"),
+        Row(name="unknowns", here=str(measurement.fit.unknowns), paper="630"),
         Row(name="extension, voxel", here=_number(_extension(measurement), 1), paper="about 15"),
         Row(name="largest strain measured, %", here=_number(strain * 100, 2), paper="8 to 9"),
     ]
@@ -185,8 +185,8 @@ def _largest_strain(measurement: Measurement) -> float:
 
 
 def _observability(measurement: Measurement) -> list[dict[str, str]]:
-    share = measurement.data_share[:, measurement.observed]
-    spread = measurement.amplitude_std[:, measurement.observed]
+    share = measurement.motion.data_share[:, measurement.motion.observed]
+    spread = measurement.motion.amplitude_std[:, measurement.motion.observed]
     return [
         {
             "name": name.replace("_", " "),
@@ -194,7 +194,7 @@ def _observability(measurement: Measurement) -> list[dict[str, str]]:
             "lowest": _number(float(np.nanmin(share[..., k])) * 100, 1) if np.isfinite(share[..., k]).any() else "—",
             "std": _number(float(nan_mean(spread[..., k])), 3),
         }
-        for k, name in enumerate(measurement.basis.motions)
+        for k, name in enumerate(measurement.motion.basis.names)
     ]
 
 

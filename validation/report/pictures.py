@@ -34,7 +34,7 @@ class Picture:
 
 def pictures(measurement: Measurement, experiment: Experiment | None, truth: TruePoints | None) -> list[Picture]:
     """Draw all figures that the data allow, in the paper's order."""
-    steps = selected_steps(len(measurement.angle_rad))
+    steps = selected_steps(len(measurement.recording.angle_rad))
     centre = centre_line(measurement, truth)
     result = []
     if experiment is not None:
@@ -52,7 +52,7 @@ def pictures(measurement: Measurement, experiment: Experiment | None, truth: Tru
 
 def of_volumes(measurement: Measurement) -> bool:
     """Return whether volumes were compared, not radiographs: then no radiograph has a residual."""
-    return measurement.residual_final.size == 0
+    return measurement.fit.residual_final.size == 0
 
 
 def selected_steps(steps: int) -> list[int]:
@@ -70,7 +70,7 @@ def _radiographs(measurement: Measurement, experiment: Experiment, steps: Sequen
             [image / largest for image in images],
             _titles(measurement, steps),
             axes,
-            window=measurement.window,
+            window=measurement.recording.window,
         ),
     )
     return Picture(
@@ -83,7 +83,7 @@ def _radiographs(measurement: Measurement, experiment: Experiment, steps: Sequen
 
 def _force(measurement: Measurement, steps: Sequence[int]) -> Picture:
     figure, (ax,) = draw.new_figure(7.5, 3)
-    draw.draw_force(measurement.time_s, measurement.force_N, steps, ax)
+    draw.draw_force(measurement.recording.time_s, measurement.recording.force_N, steps, ax)
     return Picture(
         name="fig04_force",
         caption="Measured force; it serves only as one of the time functions. Dots: the steps shown in the "
@@ -96,13 +96,13 @@ def _residuals(measurement: Measurement, steps: Sequence[int]) -> list[Picture]:
     if of_volumes(measurement):
         return []
     rows = (
-        ("fig05_residual_initial", "before any motion is measured", measurement.residual_initial),
-        ("fig06_residual_rigid", "after the rigid stage", measurement.residual_rigid),
-        ("fig08_residual_final", "at the end", measurement.residual_final),
+        ("fig05_residual_initial", "before any motion is measured", measurement.fit.residual_initial),
+        ("fig06_residual_rigid", "after the rigid stage", measurement.fit.residual_rigid),
+        ("fig08_residual_final", "at the end", measurement.fit.residual_final),
     )
     # after the rigid stage and at the end share one scale: their difference is what sections add
-    coarse = draw.scale_limit(list(measurement.residual_initial[steps]))
-    fine = draw.scale_limit(list(measurement.residual_rigid[steps]))
+    coarse = draw.scale_limit(list(measurement.fit.residual_initial[steps]))
+    fine = draw.scale_limit(list(measurement.fit.residual_rigid[steps]))
     result = []
     for (name, when, fields), limit in zip(rows, (coarse, fine, fine), strict=True):
         shown = list(fields[steps])
@@ -142,17 +142,17 @@ def _translations(centre: CentreLine) -> Picture:
 
 def _snr(measurement: Measurement) -> Picture:
     figure, (ax,) = draw.new_figure(8.5, 3.4)
-    m = measurement
+    fit = measurement.fit
     draw.draw_snr(
-        m.snr_initial_db, m.snr_rigid_db, m.snr_final_db, m.snr_noise_db,
-        float(nan_mean(m.snr_reprojection_db)), ax,
+        fit.snr_initial_db, fit.snr_rigid_db, fit.snr_final_db, fit.snr_noise_db,
+        float(nan_mean(fit.snr_reprojection_db)), ax,
     )  # fmt: skip
     return Picture(
         name="fig09_snr",
         caption="Signal-to-noise ratio of each step, "
         + (
             "20 log10(std(volume) / std(residual)) over the used voxels."
-            if of_volumes(m)
+            if of_volumes(measurement)
             else "20 log10(std(radiograph) / std(residual)) over the used pixels. It swings with the turn because "
             "some angles hide the motion."
         ),
@@ -249,7 +249,8 @@ def _row(images: Sequence[NDArray[Any]], paint: Callable[[list[Any]], object]) -
 
 
 def _titles(measurement: Measurement, steps: Sequence[int]) -> list[str]:
-    degrees = np.rad2deg(measurement.angle_rad)
+    degrees = np.rad2deg(measurement.recording.angle_rad)
     return [
-        f"step {step}, {(degrees[step] + 180) % 360 - 180:.1f}°\n{measurement.force_N[step]:.0f} N" for step in steps
+        f"step {step}, {(degrees[step] + 180) % 360 - 180:.1f}°\n{measurement.recording.force_N[step]:.0f} N"
+        for step in steps
     ]

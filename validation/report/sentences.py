@@ -112,7 +112,7 @@ def residual_sentences(tests: ResidualTests | None, *, noise_known: bool, truth_
 
 def noise_known(measurement: Measurement) -> bool:
     """Return whether the noise of the detector was known, not taken from the residual."""
-    return bool(np.isfinite(measurement.snr_noise_db).any())
+    return bool(np.isfinite(measurement.fit.snr_noise_db).any())
 
 
 def _without_truth(*, white: bool, chi2: float) -> str:
@@ -131,7 +131,7 @@ def _without_truth(*, white: bool, chi2: float) -> str:
 
 def _missing(measurement: Measurement, small: dict[str, float]) -> str:
     causes = ["motion outside the space of sections and time functions"]
-    if _NAMES["along_beam"] in small and measurement.residual_final.size:
+    if _NAMES["along_beam"] in small and measurement.fit.residual_final.size:
         causes.append("contraction and motion along the beam, which look alike")
     causes.append("the sampling of volume and radiographs")
     return f"it holds noise and prior, which cannot tell errors of the model ({'; '.join(causes)})."
@@ -139,9 +139,11 @@ def _missing(measurement: Measurement, small: dict[str, float]) -> str:
 
 def _outside(measurement: Measurement, truth: TruePoints | None) -> str:
     """Return how far the true motion is from all that the unknowns could say, where time functions join the steps."""
-    if truth is None or measurement.covariance.ndim != 2:
+    if truth is None or measurement.motion.covariance.ndim != 2:
         return ""
-    _, missed = true_coefficients(measurement.basis, measurement.time_functions, measurement.voxel_mm, truth)
+    _, missed = true_coefficients(
+        measurement.motion.basis, measurement.motion.time_functions, measurement.recording.voxel_mm, truth
+    )
     return (
         " The nearest motion in that space is "
         f"{_joined([f'{value:.3f}' for value in missed])} voxel rms from the true one in x, y and z."

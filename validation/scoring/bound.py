@@ -17,69 +17,33 @@ from __future__ import annotations
 import json
 import tempfile
 import uuid
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.deviations import Knowledge, Quantities
 from pdvc.equations import Images, linearise
 from pdvc.experiment import Experiment, read_experiment
 from pdvc.gauss_newton import hessian
-from pdvc.history import time_basis
-from pdvc.measurement import step_covariance, strain_std, turned_std
 from pdvc.noise import separate
-from pdvc.options import MeasureOptions, resolved
-from pdvc.preparation import bases, calibrated, noise_of, prepare
+from pdvc.options import MeasureOptions
+from pdvc.preparation import noise_of, prepare
 from pdvc.prior import solved
 from pdvc.progress import Progress, silent
 from pdvc.sections import SectionBasis
-from pdvc.store import Store
-from pdvc.window import used_window
+from pdvc.setup import set_up
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
 from simulator.truth import read_truth
-from validation.scoring.centre_line import TruePoints, current_positions, points_on_axis
-from validation.scoring.interval_calibration import Quantities, true_coefficients
+from validation.scoring.centre_line import TruePoints
+from validation.scoring.interval_calibration import true_coefficients
 
 Floats = NDArray[np.float64]
 
 _PHOTONS = 1e13
 """Photons in a pixel of what counts as free of noise: the rounding of counts is a hundred times as much."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bound:
-    """Hold the bound on the covariance of a motion."""
-
-    basis: SectionBasis
-    time_functions: Floats
-    angle_rad: Floats
-    """(step,)"""
-    voxel_mm: float
-    covariance: Floats
-    """As of Measurement."""
-
-    def quantities(self, truth: TruePoints) -> Quantities:
-        """Return rms standard deviations over steps and material points between the sections.
-
-        The strain is that of the scores: between material levels of the axis, about a section apart.
-        """
-        positions = current_positions(truth)
-        low, high = self.basis.height_mm[[0, -1]]
-        axis = points_on_axis(truth.point_mm, float(np.mean(np.diff(self.basis.height_mm))))
-        turned, strain = [], []
-        for step, x in enumerate(positions):
-            covariance = step_covariance(self.covariance, self.time_functions, step)
-            inside = (x[:, 2] >= low) & (x[:, 2] <= high)
-            turned.append(turned_std(self.basis, covariance, float(self.angle_rad[step]), x[inside]))
-            levels = axis[inside[axis]]
-            now, before = x[levels, 2], truth.point_mm[levels, 2]
-            stretched = np.diff(now) / np.diff(before)
-            strain.append(strain_std(self.basis, covariance, now, self.voxel_mm) * stretched)
-        across, vertical, along = np.sqrt((np.concatenate(turned) ** 2).mean(axis=0)).tolist()
-        of_strain = float(np.sqrt((np.concatenate(strain) ** 2).mean()))
-        return Quantities(across_beam=across, vertical=vertical, along_beam=along, strain=of_strain)
 
 
 def noise_free(scenario: Scenario) -> Scenario:
@@ -90,7 +54,7 @@ def noise_free(scenario: Scenario) -> Scenario:
 
 def bound_of(
     scenario: Scenario, options: MeasureOptions, clean: Path | None = None, *, progress: Progress = silent
-) -> tuple[Bound, TruePoints]:
+) -> tuple[Knowledge, TruePoints]:
     """Return the bound of a scenario for the bases and the prior of some options, and the true motion.
 
     `clean` is a folder of noise-free radiographs (`simulator.clean`), shared with other work on the scenario.
@@ -110,23 +74,19 @@ def bound_of(
         return _bound(known, truth, options, progress), truth
 
 
-def _bound(experiment: Experiment, truth: TruePoints, options: MeasureOptions, progress: Progress) -> Bound:
+def _bound(experiment: Experiment, truth: TruePoints, options: MeasureOptions, progress: Progress) -> Knowledge:
     """Return the bound from an experiment whose counts are free of the noise that its description tells of."""
-    options = resolved(options, experiment.geometry)
-    store = Store(None, experiment)
-    calibration, outline = calibrated(experiment, options, store, progress)
-    window = used_window(experiment.geometry, options, outline.hull)
-    time_functions = time_basis(options.time, experiment.test)
-    _, basis = bases(experiment.geometry, window, outline.hull, options)
-    prepared = prepare(experiment, calibration, outline, window, 1, options, store, progress)
-    noise = noise_of(experiment, calibration, prepared, 0.0)
+    setup = set_up(experiment, options, progress=progress)
+    basis, time_functions = setup.sections, setup.time_functions()
+    prepared = prepare(setup, 1, progress)
+    noise = noise_of(setup, prepared)
     assert noise is not None, "a scenario tells its noise"
     information = np.stack([1 / noise.step(t).variance for t in range(len(experiment.test))])
     images = replace(prepared.images, weight=np.where(prepared.images.weight > 0, information, 0).astype(np.float32))
     voxel_mm = experiment.geometry.voxel_mm
     coefficients, _ = true_coefficients(basis, time_functions, voxel_mm, truth)
     amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
-    return Bound(
+    return Knowledge(
         basis=basis,
         time_functions=time_functions,
         angle_rad=experiment.test.angle_rad,
@@ -159,7 +119,7 @@ def kept_bound(scenario: Scenario, options: MeasureOptions, path: Path, clean: P
         return Quantities(**json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):  # not there, or damaged
         found, truth = bound_of(scenario, options, clean)
-        quantities = found.quantities(truth)
+        quantities = found.quantities(truth.point_mm, truth.displacement_mm)
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
         partial.write_text(json.dumps(asdict(quantities)), encoding="utf-8")

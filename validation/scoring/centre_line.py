@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.deviations import points_on_axis
 from pdvc.measurement import Measurement, MeasurementError
 
 Floats = NDArray[np.float64]
@@ -73,21 +74,21 @@ def measured_at(measurement: Measurement, points_mm: Floats) -> Floats:
 
     NaN for points outside the observed sections, and for those whose motion an unobserved section shares.
     """
-    amplitude = np.where(measurement.observed[:, None], measurement.amplitude, np.nan)
+    amplitude = np.where(measurement.motion.observed[:, None], measurement.motion.amplitude, np.nan)
     lowest, highest = observed_range(measurement)
     result = np.empty(points_mm.shape)
     for step, points in enumerate(points_mm):
-        result[step] = measurement.basis.displacement(amplitude[step], points)
+        result[step] = measurement.motion.basis.displacement(amplitude[step], points)
         result[step, (points[:, 2] < lowest) | (points[:, 2] > highest)] = np.nan
     return result
 
 
 def observed_range(measurement: Measurement) -> tuple[float, float]:
     """Return the heights of the lowest and the highest observed section, mm."""
-    heights = measurement.basis.height_mm[measurement.observed]
+    heights = measurement.motion.basis.height_mm[measurement.motion.observed]
     if len(heights) == 0:
         raise MeasurementError("measurement: expected at least one observed section, found none")
-    if len(measurement.basis.height_mm) == 1:
+    if len(measurement.motion.basis.height_mm) == 1:
         return -np.inf, np.inf
     return float(heights[0]), float(heights[-1])
 
@@ -112,38 +113,26 @@ def centre_line(
     return CentreLine(
         level_mm=truth.point_mm[chosen, 2],
         measured=measured,
-        true=np.where(np.isfinite(measured), true / measurement.voxel_mm, np.nan),
-        voxel_mm=measurement.voxel_mm,
+        true=np.where(np.isfinite(measured), true / measurement.recording.voxel_mm, np.nan),
+        voxel_mm=measurement.recording.voxel_mm,
     )
 
 
 def _at_sections(measurement: Measurement) -> CentreLine:
-    height = measurement.basis.height_mm
-    points = np.zeros((len(measurement.angle_rad), len(height), 3))
+    height = measurement.motion.basis.height_mm
+    points = np.zeros((len(measurement.recording.angle_rad), len(height), 3))
     points[..., 2] = height
     return CentreLine(
         level_mm=height,
         measured=measured_at(measurement, points),
         true=None,
-        voxel_mm=measurement.voxel_mm,
+        voxel_mm=measurement.recording.voxel_mm,
     )
 
 
 def _section_spacing(measurement: Measurement) -> float:
-    height = measurement.basis.height_mm
+    height = measurement.motion.basis.height_mm
     return float(np.mean(np.diff(height))) if len(height) > 1 else 0.0
-
-
-def points_on_axis(point_mm: Floats, spacing_mm: float) -> NDArray[np.intp]:
-    """Return the points nearest the axis, from the bottom up, levels about `spacing_mm` apart."""
-    from_axis = np.hypot(point_mm[:, 0], point_mm[:, 1])
-    order = np.lexsort((from_axis, np.round(point_mm[:, 2], 6)))
-    height = np.round(point_mm[order, 2], 6)
-    first = order[np.concatenate([[True], np.diff(height) > 0])]
-    if len(first) < 2:
-        return first
-    stride = max(1, round(spacing_mm / float(np.mean(np.diff(point_mm[first, 2])))))
-    return first[(len(first) - 1) % stride // 2 :: stride]
 
 
 def nan_mean(values: Floats, axis: int | None = None) -> Floats:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc.measurement import Measurement, directions
+from pdvc.deviations import beam_frame
+from pdvc.measurement import Measurement
 from validation.scoring.centre_line import TruePoints, centre_line
 
 Floats = NDArray[np.float64]
@@ -45,7 +46,7 @@ def centre_line_deviation(measurement: Measurement, truth: TruePoints | None = N
         strain_std[step] = measurement.strain_std(step, height[step]) * stretched
     error, strain_error = None, None
     if centre.true is not None:
-        error = (centre.measured - centre.true) @ directions(measurement.angle_rad).transpose(0, 2, 1)
+        error = (centre.measured - centre.true) @ beam_frame(measurement.recording.angle_rad).transpose(0, 2, 1)
         strain_error = centre.strain(centre.measured) - centre.strain(centre.true)
     return CentreLineDeviation(
         level_mm=centre.level_mm,

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
+from pdvc.deviations import Quantities
 from pdvc.measurement import Measurement
 from pdvc.sections import SectionBasis
 from validation.scoring.centre_line import TruePoints, current_positions
@@ -34,18 +35,8 @@ LEVELS = (0.50, 0.90, 0.95)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quantities:
-    """Hold one number for each direction and for the strain; NaN where nothing is scored."""
-
-    across_beam: float
-    vertical: float
-    along_beam: float
-    strain: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class IntervalCalibration:
-    """Hold what one measurement shows of its uncertainties."""
+    """What one measurement shows of its uncertainties."""
 
     predicted: Quantities
     """rms over points and steps of the standard deviations: voxels, and strain without unit"""
@@ -115,15 +106,15 @@ def true_coefficients(
 
 def _nees(measurement: Measurement, truth: TruePoints) -> tuple[float, int]:
     """Return d^T C^-1 d over the observed sections, and its degrees of freedom; NaN without a whole covariance."""
-    functions = measurement.time_functions
-    if measurement.covariance.ndim != 2:
+    functions = measurement.motion.time_functions
+    if measurement.motion.covariance.ndim != 2:
         return math.nan, 0
-    true, _ = true_coefficients(measurement.basis, functions, measurement.voxel_mm, truth)
+    true, _ = true_coefficients(measurement.motion.basis, functions, measurement.recording.voxel_mm, truth)
     norm = (functions**2).sum(axis=1)[:, None, None]
-    known = np.nan_to_num(measurement.amplitude)
+    known = np.nan_to_num(measurement.motion.amplitude)
     error = np.einsum("ft,tjk->fjk", functions, known) / norm - true
-    kept = np.broadcast_to(measurement.observed[:, None], error.shape).ravel()
-    d, c = error.ravel()[kept], measurement.covariance[np.ix_(kept, kept)]
+    kept = np.broadcast_to(measurement.motion.observed[:, None], error.shape).ravel()
+    d, c = error.ravel()[kept], measurement.motion.covariance[np.ix_(kept, kept)]
     scale = 1 / np.sqrt(np.diag(c))
     factor = linalg.cho_factor(c * scale[:, None] * scale)
     return float((d * scale) @ linalg.cho_solve(factor, d * scale)), int(kept.sum())

@@ -103,11 +103,11 @@ def noise_floor(measurement: Measurement, truth: TruePoints | None = None) -> No
 
     None where fewer than `LEAST_STEPS` of them were measured.
     """
-    measured: NDArray[np.bool_] = np.asarray(np.isfinite(measurement.amplitude).any(axis=(1, 2)))
-    steps = np.flatnonzero(measured[: constant_load_steps(measurement.force_N)])
+    measured: NDArray[np.bool_] = np.asarray(np.isfinite(measurement.motion.amplitude).any(axis=(1, 2)))
+    steps = np.flatnonzero(measured[: constant_load_steps(measurement.recording.force_N)])
     if len(steps) < LEAST_STEPS:
         return None
-    heights = measurement.basis.height_mm[measurement.observed]
+    heights = measurement.motion.basis.height_mm[measurement.motion.observed]
     levels = np.linspace(heights[0], heights[-1], LEVELS_PER_SECTION * (len(heights) - 1) + 1)
     points = np.zeros((len(measured), len(levels), 3))
     points[..., 2] = levels
@@ -115,12 +115,12 @@ def noise_floor(measurement: Measurement, truth: TruePoints | None = None) -> No
     seen = np.isfinite(u).all(axis=(0, 2))
     rest = np.full_like(u, np.nan)
     rest[:, seen] = without_rigid_motion(u[:, seen], levels[seen])
-    turning = _turning_with_the_beam(rest, measurement.angle_rad[steps])
+    turning = _turning_with_the_beam(rest, measurement.recording.angle_rad[steps])
     over_steps = turning.var(axis=0, ddof=1)
     over_levels = turning[:, seen].var(axis=1)
     return NoiseFloor(
         steps=len(steps),
-        histories=_histories(measurement.time_functions[:, steps]),
+        histories=_histories(measurement.motion.time_functions[:, steps]),
         temporal_voxel=_directions(np.sqrt(over_steps[seen].mean(axis=0))),
         spatial_voxel=_directions(np.sqrt(over_levels.mean(axis=0))),
         level_mm=levels,
@@ -154,9 +154,9 @@ def _histories(time_functions: Floats) -> int:
 def _true_error(measurement: Measurement, truth: TruePoints, steps: NDArray[np.intp]) -> TrueError:
     chosen = points_on_axis(truth.point_mm, 0.0)
     true = truth.displacement_mm[:, chosen]
-    error = (measured_at(measurement, truth.point_mm[chosen] + true) - true / measurement.voxel_mm)[steps]
+    error = (measured_at(measurement, truth.point_mm[chosen] + true) - true / measurement.recording.voxel_mm)[steps]
     always = np.isfinite(error).all(axis=(0, 2))
-    turning = _turning_with_the_beam(error[:, always], measurement.angle_rad[steps])
+    turning = _turning_with_the_beam(error[:, always], measurement.recording.angle_rad[steps])
     variance = turning.var(axis=0, ddof=1)
     return TrueError(
         scatter_voxel=_directions(np.sqrt(variance.mean(axis=0))),

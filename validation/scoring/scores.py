@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc.measurement import Measurement, MeasurementError, directions
+from pdvc.deviations import beam_frame
+from pdvc.measurement import Measurement, MeasurementError
 from validation.scoring.centre_line import TruePoints, centre_line, current_positions, measured_at, nan_mean
 from validation.scoring.interval_calibration import IntervalCalibration, interval_calibration
 
@@ -139,15 +140,15 @@ class Errors:
 
 def point_errors(measurement: Measurement, truth: TruePoints) -> Errors:
     """Compare u(X + U, t) with U(X, t) at every material point of the truth."""
-    steps = len(measurement.angle_rad)
+    steps = len(measurement.recording.angle_rad)
     if len(truth.displacement_mm) != steps:
         raise MeasurementError(
             f"truth: expected the {steps} steps of the measurement, found {len(truth.displacement_mm)}: "
             "do both belong to the same experiment?"
         )
     error = measured_at(measurement, current_positions(truth))
-    error -= truth.displacement_mm / measurement.voxel_mm
-    return Errors(components=error @ directions(measurement.angle_rad).transpose(0, 2, 1))
+    error -= truth.displacement_mm / measurement.recording.voxel_mm
+    return Errors(components=error @ beam_frame(measurement.recording.angle_rad).transpose(0, 2, 1))
 
 
 def score(
@@ -165,16 +166,18 @@ def score(
     measured, true = centre.strain(centre.measured), centre.strain(centre.true)
     scored = errors.scored.any(axis=0)
     return Scores(
-        scenario=measurement.title if scenario is None else scenario,
-        steps=len(measurement.angle_rad),
-        unknowns=measurement.unknowns,
+        scenario=measurement.recording.title if scenario is None else scenario,
+        steps=len(measurement.recording.angle_rad),
+        unknowns=measurement.fit.unknowns,
         snr_db=mean_snr(measurement),
         modes=modes_found(measurement),
         error_voxel=errors.rms(),
         bias_voxel=errors.bias(),
         random_voxel=errors.random(),
         calibration=interval_calibration(measurement, truth, errors.components),
-        chi2_reduced=math.nan if measurement.residual_tests is None else measurement.residual_tests.chi2_reduced,
+        chi2_reduced=math.nan
+        if measurement.fit.residual_tests is None
+        else measurement.fit.residual_tests.chi2_reduced,
         strain_rms=float(_rms(measured - true)),
         max_strain_true=_largest(true),
         max_strain_measured=_largest(measured),
@@ -184,8 +187,8 @@ def score(
         doubts=", ".join(measurement.verdict.names),
         seconds=Seconds(
             simulate=simulate_s,
-            reconstruct=measurement.seconds.get("reconstruct", math.nan),
-            measure=measurement.seconds.get("measure", math.nan),
+            reconstruct=measurement.provenance.seconds.get("reconstruct", math.nan),
+            measure=measurement.provenance.seconds.get("measure", math.nan),
         ),
         peak_memory_gib=peak_memory_gib,
     )
@@ -194,18 +197,18 @@ def score(
 def mean_snr(measurement: Measurement) -> Snr:
     """Average each SNR history as the paper does: the mean of the decibels."""
     return Snr(
-        reprojection=float(nan_mean(measurement.snr_reprojection_db)),
-        initial=float(nan_mean(measurement.snr_initial_db)),
-        rigid=float(nan_mean(measurement.snr_rigid_db)),
-        final=float(nan_mean(measurement.snr_final_db)),
-        noise_limit=float(nan_mean(measurement.snr_noise_db)),
+        reprojection=float(nan_mean(measurement.fit.snr_reprojection_db)),
+        initial=float(nan_mean(measurement.fit.snr_initial_db)),
+        rigid=float(nan_mean(measurement.fit.snr_rigid_db)),
+        final=float(nan_mean(measurement.fit.snr_final_db)),
+        noise_limit=float(nan_mean(measurement.fit.snr_noise_db)),
     )
 
 
 def modes_found(measurement: Measurement) -> Modes:
     """Count the modes of the rigid stage, and of all section stages together."""
     found = {"rigid": 0, "deformation": 0}
-    for stage in measurement.stages:
+    for stage in measurement.fit.stages:
         found[stage.name] += stage.modes
     return Modes(**found)
 

@@ -29,7 +29,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from pdvc.options import PROTOCOLS, MeasureOptions, resolved
+from pdvc.options import PROTOCOLS, MeasureOptions, check_discarded
 from pdvc.settings import Settings, SettingsError
 from simulator.scenario import Scenario, load_scenario
 from validation.batch.engine import Scalar
@@ -302,7 +302,7 @@ def _parsed(base: dict[str, Any], combination: Combination, path: Path) -> tuple
     scenario = Scenario.parse(values["scenario"], where=f"{where}: scenario")
     options = MeasureOptions.parse(values["options"], where=f"{where}: options")
     try:
-        resolved(options, scenario.geometry.cone_beam())
+        check_discarded(options, scenario.geometry.cone_beam())
     except ValueError as error:
         raise SettingsError(f"{where}: options: {error}") from None
     return scenario, options

@@ -24,14 +24,16 @@ from scipy import ndimage
 
 from pdvc.equations import Equations, Images, linearise
 from pdvc.experiment import Experiment, Series, read_experiment
+from pdvc.gauss_newton import GaussNewton
 from pdvc.geometry import ConeBeam
 from pdvc.history import PAPER, Angle, Polynomial, Ramp, time_basis
 from pdvc.measure import measure
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions, StageOptions
+from pdvc.pgd import Pgd
 from pdvc.projection import project
 from pdvc.rays import ray_vectors
-from pdvc.sections import RIGID, SectionBasis
+from pdvc.sections import RIGID, SectionBasis, names_of
 from pdvc.volume import Grid, Hull, Volume, hull_of
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
@@ -75,10 +77,10 @@ def small_options(scenario: Scenario) -> MeasureOptions:
     return MeasureOptions(
         discard_rows=scenario.discarded_rows,
         sections=4,
-        section_motions=RIGID,
+        section_motions=names_of(RIGID),
         time=(*PAPER[:3], Ramp(start=scenario.loading.plateau_steps, powers=(1, 2))),
-        rigid=(StageOptions(scale=2, most=3, passes_per_mode=6),),
-        deformation=(StageOptions(scale=1, solver="gauss-newton", most=8, least_change_voxel=1e-3),),
+        rigid=(StageOptions(scale=2, solver=Pgd(most_modes=3, passes_per_mode=6)),),
+        deformation=(StageOptions(scale=1, solver=GaussNewton(most_passes=8, least_change_voxel=1e-3)),),
     )
 
 

@@ -24,7 +24,7 @@ except ModuleNotFoundError as error:
 
 from pdvc.experiment import AcquisitionEntry, Description, GeometryEntry, StackEntry
 from pdvc.geometry import ConeBeam
-from pdvc.sections import RIGID, SectionBasis
+from pdvc.sections import RIGID, SectionBasis, SectionPattern
 from simulator.kinematics import BeamMotion, Motion, RigidMotion, SectionMotion
 from simulator.scenario import Scenario
 from validation.testing.small_cases import ProjectedCase, SmallExperiment, small_scenario
@@ -82,7 +82,7 @@ def cone_beams(draw: st.DrawFn, *, least_columns: int = 24, most_columns: int = 
 
 
 @st.composite
-def section_bases(draw: st.DrawFn, *, motions: tuple[str, ...] = RIGID) -> SectionBasis:
+def section_bases(draw: st.DrawFn, *, motions: tuple[SectionPattern, ...] = RIGID) -> SectionBasis:
     """Draw one to six sections at unequal heights of some mm, each with the named motions."""
     gaps = draw(st.lists(st.floats(0.1, 3.0), min_size=1, max_size=6))
     return SectionBasis(
@@ -196,7 +196,9 @@ def small_experiments(*, least_ingredients: int = 0) -> st.SearchStrategy[SmallE
 
 
 @st.composite
-def projected_cases(draw: st.DrawFn, *, motions: tuple[str, ...] = RIGID, largest_voxel: float = 0.5) -> ProjectedCase:
+def projected_cases(
+    draw: st.DrawFn, *, motions: tuple[SectionPattern, ...] = RIGID, largest_voxel: float = 0.5
+) -> ProjectedCase:
     """Draw textured bars moved by known amplitudes, with radiographs by pdvc's own projector and no noise.
 
     Detectors have 28 to 36 columns and more rows, a case has 10 to 16 steps over a turn and a half, two to four

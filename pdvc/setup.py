@@ -1,0 +1,187 @@
+"""What every measurement starts from: calibration, outline, window, sections and options, found once and handed on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.beam_hardening import Outline, find_outline
+from pdvc.experiment import Experiment, Series
+from pdvc.geometry import ConeBeam
+from pdvc.history import time_basis
+from pdvc.measurement import Recording
+from pdvc.options import MeasureOptions, ResolvedOptions, check_discarded, resolved
+from pdvc.prior import Prior
+from pdvc.progress import Progress, silent
+from pdvc.radiographs import IDENTITY, Calibration, binned, calibrate, grey_levels
+from pdvc.sections import RIGID, SectionBasis, SectionPattern, motions_named
+from pdvc.store import Keep, Store
+from pdvc.volume import Hull
+from pdvc.window import height_mm, used_window
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+_OUTLINE_ROWS = 240
+"""The outline is found on radiographs binned to about this many rows."""
+_OUTLINE_VIEWS = 150
+ROWS_OF_A_SECTION = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """An experiment made ready to be measured: what does not depend on the scale, nor on the motion."""
+
+    experiment: Experiment
+    options: ResolvedOptions
+    store: Store
+    calibration: Calibration
+    """Of the detector, with the beam-hardening polynomial."""
+    outline: Outline
+    """The sample's hull in the reference scan."""
+    window: tuple[int, int, int, int]
+    """Used rows and columns at scale 1: row_from, row_to, column_from, column_to."""
+    rigid: SectionBasis
+    """The sample as one rigid body: one section."""
+    sections: SectionBasis
+    """The sections, spread over the used height."""
+
+    @property
+    def geometry(self) -> ConeBeam:
+        """Return the scanner's geometry at scale 1."""
+        return self.experiment.geometry
+
+    def recording(self) -> Recording:
+        """Return what was recorded, for the result."""
+        test = self.experiment.test
+        return Recording(
+            title=self.experiment.title,
+            voxel_mm=self.geometry.voxel_mm,
+            source_axis_mm=self.geometry.source_axis_mm,
+            angle_rad=test.angle_rad,
+            time_s=test.time_s,
+            force_N=test.force_N,
+            window=self.window,
+        )
+
+    def time_functions(self) -> Floats:
+        """Return the orthonormal time functions (function, step) of the options."""
+        return time_basis(self.options.time, self.experiment.test)
+
+    def prior(self, basis: SectionBasis) -> Prior:
+        """Return the prior of the options for a basis."""
+        return Prior(deviation_voxel=np.full(basis.shape, self.options.prior_voxel))
+
+    def with_sections(self, count: int) -> SectionBasis:
+        """Return the section basis with another number of sections."""
+        return section_basis(self.geometry, self.window, self.outline.hull, count, self.sections.motions)
+
+
+def set_up(
+    experiment: Experiment, options: MeasureOptions, *, work: Path | None = None, progress: Progress = silent
+) -> Setup:
+    """Calibrate, outline the sample in the reference scan, and choose window and sections.
+
+    `work` is a folder for intermediate results. Raises ValueError, in one line, where options and experiment do not
+    fit each other, or no sample is found.
+    """
+    geometry, store = experiment.geometry, Store(work, experiment)
+    check_discarded(options, geometry)
+    calibration, outline = _calibrated(experiment, options, store, progress)
+    window = used_window(geometry, outline.hull, options.discard_rows, options.discard_columns)
+    rigid, sections = _bases(geometry, window, outline.hull, options)
+    return Setup(
+        experiment=experiment,
+        options=resolved(options, experiment, window[0], window[2]),
+        store=store,
+        calibration=calibration,
+        outline=outline,
+        window=window,
+        rigid=rigid,
+        sections=sections,
+    )
+
+
+def _calibrated(
+    experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress
+) -> tuple[Calibration, Outline]:
+    calibration = calibrate(experiment)
+    given = {"fit": None, "none": IDENTITY}.get(str(options.beam_hardening), options.beam_hardening)
+    polynomial = given if isinstance(given, tuple) else None
+    keep = partial(store.of_reference, "outline", (calibration, polynomial))
+    outline = outlined(experiment.reference, experiment.geometry, calibration, polynomial, keep, progress)
+    return calibration.with_polynomial(outline.polynomial), outline
+
+
+def outlined(
+    series: Series,
+    geometry: ConeBeam,
+    calibration: Calibration,
+    polynomial: tuple[float, float, float] | None,
+    keep: Keep,
+    progress: Progress,
+) -> Outline:
+    """Return the sample's outline in a full scan; `calibration` without beam hardening, else as in `find_outline`."""
+    factor = max(1, round(geometry.rows / _OUTLINE_ROWS))
+    chosen = np.unique(np.linspace(0, len(series), min(_OUTLINE_VIEWS, len(series)), endpoint=False).astype(int))
+
+    def view(i: int) -> Image:
+        return binned(grey_levels(series.counts[chosen[i]], calibration), factor)
+
+    def found() -> dict[str, Floats]:
+        outline = find_outline(view, geometry.binned(factor), series.angle_rad[chosen], polynomial, progress=progress)
+        hull = outline.hull
+        return {
+            "place_mm": np.array([hull.z_mm, hull.slab_mm]),
+            "support_mm": hull.support_mm,
+            "polynomial": np.array(outline.polynomial),
+        }
+
+    kept = keep(found)
+    z_mm, slab_mm = kept["place_mm"]
+    c1, c2, c3 = (float(c) for c in kept["polynomial"])
+    return Outline(
+        hull=Hull(z_mm=float(z_mm), slab_mm=float(slab_mm), support_mm=kept["support_mm"]), polynomial=(c1, c2, c3)
+    )
+
+
+def _bases(
+    geometry: ConeBeam, window: tuple[int, int, int, int], hull: Hull, options: MeasureOptions
+) -> tuple[SectionBasis, SectionBasis]:
+    """Return the rigid basis, one section with the rigid motions that the sections can follow, and the sections."""
+    sections = section_basis(geometry, window, hull, options.sections, motions_named(options.section_motions))
+    middle = np.array([(sections.height_mm[0] + sections.height_mm[-1]) / 2])
+    single = {
+        motion: SectionBasis(height_mm=middle, radius_mm=sections.radius_mm, motions=(motion,)) for motion in RIGID
+    }
+    followed = tuple(motion for motion, alone in single.items() if sections.reproduces(alone))
+    if not followed:
+        raise ValueError(
+            "section_motions: expected some by which the sample can move as one rigid body, got "
+            f"{', '.join(options.section_motions)}"
+        )
+    return SectionBasis(height_mm=middle, radius_mm=sections.radius_mm, motions=followed), sections
+
+
+def section_basis(
+    geometry: ConeBeam,
+    window: tuple[int, int, int, int],
+    hull: Hull,
+    count: int,
+    motions: tuple[SectionPattern, ...],
+) -> SectionBasis:
+    """Return sections spread over the used height; raises ValueError for sections closer than two rows."""
+    if count > max((window[1] - window[0]) / ROWS_OF_A_SECTION, 2):
+        raise ValueError(
+            f"sections: expected at most one for every {ROWS_OF_A_SECTION} of the {window[1] - window[0]} used rows, "
+            f"got {count}"
+        )
+    low, high = hull.box_mm()
+    radius = float(np.hypot(*(high - low)[:2]) / 4)
+    top = height_mm(geometry, window[0] - 0.5)
+    bottom = height_mm(geometry, window[1] - 0.5)
+    return SectionBasis(height_mm=np.linspace(bottom, top, count), radius_mm=radius, motions=motions)
