@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 COARSE = 4
-"""The hull is found on voxels this many times larger, as pdvc.measure does at full size."""
+"""The hull is found on voxels this many times larger, as pdvc.protocol does at full size."""
 
 
 @dataclass(frozen=True, kw_only=True)

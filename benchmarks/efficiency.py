@@ -17,8 +17,8 @@ import numpy as np
 from benchmarks.rows import Row, keep, show
 from pdvc.gauss_newton import GaussNewton
 from pdvc.history import PAPER
-from pdvc.measure import measure
 from pdvc.options import MeasureOptions, StageOptions
+from pdvc.protocol import measure
 from pdvc.sections import RIGID, names_of
 from simulator.scenario import load_scenario
 from validation.batch.trial import simulated

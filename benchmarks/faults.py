@@ -204,7 +204,7 @@ def stage(folder: Path) -> str:
 def to_begin_s() -> float:
     """Return how long a command takes before it does anything, s."""
     began = time.perf_counter()
-    subprocess.run([sys.executable, "-c", "import pdvc.measure, validation.job, simulator.scanner"], check=True)
+    subprocess.run([sys.executable, "-c", "import pdvc.protocol, validation.job, simulator.scanner"], check=True)
     return time.perf_counter() - began
 
 

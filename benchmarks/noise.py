@@ -10,7 +10,7 @@ from pathlib import Path
 
 from benchmarks.rows import Row, keep, show
 from pdvc.experiment import read_experiment
-from pdvc.measure import MeasureOptions, measure
+from pdvc.protocol import MeasureOptions, measure
 from simulator.scanner import simulate
 from simulator.scenario import Scenario, load_scenario
 from simulator.truth import read_truth

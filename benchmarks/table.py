@@ -17,8 +17,8 @@ from benchmarks import rtk, stored
 from benchmarks.case import Case, amplitude, case
 from benchmarks.timing import Seconds, in_turns, machine, once, with_threads
 from pdvc.experiment import read_experiment
-from pdvc.measure import MeasureOptions, measure
 from pdvc.projection import normal_equations
+from pdvc.protocol import MeasureOptions, measure
 from pdvc.reconstruction import fdk
 from simulator.radiography import path_lengths
 from simulator.scanner import simulate

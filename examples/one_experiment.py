@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 from pdvc.experiment import read_experiment
-from pdvc.measure import measure
 from pdvc.measurement_file import write_measurement
+from pdvc.protocol import measure
 from simulator.scanner import simulate
 from simulator.truth import read_truth
 from validation.scoring.scores import score

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pdvc.measure import measure
+from pdvc.protocol import measure
 from validation.scoring.scores import score
 from validation.testing.small_cases import SmallExperiment, small_scenario
 

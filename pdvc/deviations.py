@@ -108,6 +108,6 @@ def points_on_axis(point_mm: Floats, spacing_mm: float) -> NDArray[np.intp]:
     height = np.round(point_mm[order, 2], 6)
     first = order[np.concatenate([[True], np.diff(height) > 0])]
     if len(first) < 2:
-        return first
+        return np.asarray(first)
     stride = max(1, round(spacing_mm / float(np.mean(np.diff(point_mm[first, 2])))))
-    return first[(len(first) - 1) % stride // 2 :: stride]
+    return np.asarray(first[(len(first) - 1) % stride // 2 :: stride])

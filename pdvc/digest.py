@@ -7,6 +7,7 @@ arrays count with every element, numbers with every bit, records with every fiel
 from __future__ import annotations
 
 import hashlib
+import inspect
 import platform
 import struct
 from collections.abc import Mapping
@@ -22,6 +23,8 @@ from pydantic import BaseModel
 
 COMPUTING = ("numpy", "scipy", "numba")
 """The libraries that results depend on, to the last digit."""
+OWN = ("pdvc", "simulator", "validation")
+"""The packages whose text counts as a whole, as `software`."""
 _AT_ONCE = 1 << 24
 """Bytes of an array that are read at a time: a memory map is streamed."""
 
@@ -95,9 +98,24 @@ def _add(found: Any, value: Any) -> None:
 
 def _add_record(found: Any, record: Any, names: Any) -> None:
     _head(found, "record", type(record).__qualname__)
+    if type(record).__module__.partition(".")[0] not in OWN:
+        # what a user's own kind of time function, or solver, does is part of what it is
+        _head(found, "code", _code_of(type(record)))
     for name in names:
         _add(found, name)
         _add(found, getattr(record, name))
+
+
+@cache
+def _code_of(kind: type) -> str:
+    """Return the text of a class, or, where that is nowhere kept, the code that its functions were compiled to."""
+    try:
+        return inspect.getsource(kind)
+    except (OSError, TypeError):
+        functions = (part for part in vars(kind).values() if inspect.isfunction(part))
+        return "\n".join(
+            f"{part.__name__} {part.__code__.co_code.hex()} {part.__code__.co_consts}" for part in functions
+        )
 
 
 def _head(found: Any, kind: str, text: str) -> None:

@@ -190,7 +190,7 @@ def time_basis(parts: tuple[TimeFunction, ...], series: Series) -> Floats:
             kept.append(rest / np.linalg.norm(rest))
     if not kept:
         raise ValueError("time functions: expected at least one that is not zero over the steps")
-    return np.stack(kept) * np.sqrt(len(series))
+    return np.asarray(np.stack(kept) * np.sqrt(len(series)))
 
 
 def settled(parts: tuple[TimeFunction, ...], series: Series) -> tuple[TimeFunction, ...]:

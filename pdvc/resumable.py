@@ -31,7 +31,7 @@ def measure_into(
     Raises ValueError for data that cannot be used, or whose result is not finite, InUseError where another process is
     at the same file.
     """
-    from pdvc.measure import measure
+    from pdvc.protocol import measure
 
     folder = work or file.with_name(file.name + ".work")
     new = not folder.exists()

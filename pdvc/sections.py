@@ -129,7 +129,7 @@ class SectionBasis:
 
         `amplitude` (..., section, motion) in voxels; returns (..., section, 3, 4) = [G | t] in voxels.
         """
-        return np.einsum("...jk,jkab->...jab", np.asarray(amplitude, dtype=float), self.patterns())
+        return np.asarray(np.einsum("...jk,jkab->...jab", np.asarray(amplitude, dtype=float), self.patterns()))
 
     def weights(self, z_mm: ArrayLike) -> Floats:
         """Return the hat functions p_j at heights z, mm: (..., section); they add up to one."""
@@ -156,7 +156,7 @@ class SectionBasis:
         maps = np.einsum("pj,jab->pab", weights, np.nan_to_num(affine))
         # 0 x NaN is NaN, but a section that takes no part in a point must not spoil it
         maps[(weights[:, np.isnan(affine).any(axis=(1, 2))] > 0).any(axis=1)] = np.nan
-        return np.einsum("pab,pb->pa", maps[..., :3], points) + maps[..., 3]
+        return np.asarray(np.einsum("pab,pb->pa", maps[..., :3], points) + maps[..., 3])
 
     def reproduced(self, amplitude: ArrayLike, single: SectionBasis) -> Floats:
         """Return the amplitudes of this basis that reproduce a motion of `single`, a basis of one section.

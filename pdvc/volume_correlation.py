@@ -39,12 +39,12 @@ from pdvc.data_checks import doubts_of_reference, usable
 from pdvc.equations import Equations
 from pdvc.experiment import Experiment, InterruptedScan
 from pdvc.history import Steps, time_basis
-from pdvc.measure import versions
 from pdvc.measurement import MeasuredMotion, Measurement, Provenance, Stage, unfitted
 from pdvc.options import MeasureOptions, coarse_scale
 from pdvc.preparation import reference_volume, scan_volume
 from pdvc.prior import LEAST_RMS, Prior
 from pdvc.progress import Progress, silent
+from pdvc.protocol import versions
 from pdvc.radiographs import IDENTITY, snr_db
 from pdvc.result_checks import doubts_of_solution
 from pdvc.sections import SectionBasis

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pdvc.experiment import read_experiment
-from pdvc.measure import measure
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions
+from pdvc.protocol import measure
 from simulator.scanner import simulate
 from tests import synthetic_records as records
 from tests.tiny_scenarios import trial

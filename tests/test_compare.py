@@ -18,7 +18,7 @@ from validation.compare.comparison import Comparison, with_scans
 from validation.compare.figures import Point, cost_figure, draw_cost, draw_steps, steps_figure, style_of
 from validation.compare.paired import QUANTITIES
 from validation.compare.tables import TextTable, number, with_bounds, with_interval
-from validation.methods.registry import Method, looks_at_volumes
+from validation.methods.registry import Method
 from validation.report.figures import new_figure
 from validation.scoring.bootstrap import Estimate
 
@@ -33,16 +33,15 @@ def tiny(**changes):
 
 
 def by_projections(experiment):
-    """Assume nothing."""
+    """Do nothing."""
 
 
-@looks_at_volumes
 def by_scans(experiment):
-    """Assume that the test may be held."""
+    """Do nothing."""
 
 
-PROJECTIONS = Method(name="projections", function=by_projections)
-SCANS = Method(name="scans", function=by_scans)
+PROJECTIONS = Method(name="projections", measure=by_projections, assumes="Assume nothing.")
+SCANS = Method(name="scans", measure=by_scans, assumes="Assume that the test may be held.", looks_at="volumes")
 
 
 # What is run
@@ -215,7 +214,7 @@ from pathlib import Path
 import numpy as np
 
 from pdvc.gauss_newton import GaussNewton
-from pdvc.measure import measure
+from pdvc.protocol import measure
 from pdvc.options import MeasureOptions, StageOptions
 from validation.methods.registry import Method
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from scipy import linalg
 
 from pdvc.history import Angle, Force, Polynomial
-from pdvc.measure import measure
+from pdvc.protocol import measure
 from simulator.kinematics import Composition, RigidMotion, rotation_matrix
 from simulator.scenario import course_of
 from simulator.truth import sample_truth

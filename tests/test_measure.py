@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pdvc.measure import measure
 from pdvc.options import StageOptions
 from pdvc.pgd import Pgd
+from pdvc.protocol import measure
 from validation.testing.small_cases import SmallExperiment, small_scenario
 
 

@@ -1,7 +1,8 @@
 """Options: what is left open follows the detector, what is impossible is refused, and the paper's are the paper's."""
 
-from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
@@ -11,7 +12,6 @@ from pdvc.options import MeasureOptions, StageOptions, check_discarded, paper_op
 from pdvc.pgd import Pgd
 from pdvc.sections import RIGID, names_of
 from pdvc.settings import SettingsError
-from tests.test_store import experiment
 
 
 def scanner(rows, columns):
@@ -20,7 +20,8 @@ def scanner(rows, columns):
 
 def resolved_for(options, rows, columns):
     """Return the options as they are for a detector, with 3 rows and 2 columns left out."""
-    return resolved(options, replace(experiment(), geometry=scanner(rows, columns)), 3, 2)
+    test = SimpleNamespace(force_N=np.full(20, 250.0))
+    return resolved(options, SimpleNamespace(geometry=scanner(rows, columns), test=test), 3, 2)
 
 
 def scales(stages):

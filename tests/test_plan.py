@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from pdvc.experiment import Series, read_experiment
 from pdvc.history import Fourier, Polynomial, Ramp, time_basis
-from pdvc.measure import measure
+from pdvc.protocol import measure
 from simulator.scanner import simulate
 from simulator.truth import read_truth
 from tests.command_line import pdvc_bench
 from tests.laws import law
 from tests.tiny_scenarios import TINY, trial
-from validation.plan.designs import design_of, plan
+from validation.plan.simulated import design_of, plan
 from validation.plan.tables import designs_csv, designs_table, weak_table
 from validation.scoring.interval_calibration import interval_calibration
 from validation.scoring.scores import point_errors

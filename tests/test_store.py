@@ -19,8 +19,8 @@ from pdvc.digest import digest
 from pdvc.experiment import Experiment, InterruptedScan, Series
 from pdvc.geometry import ConeBeam
 from pdvc.history import TimeFunction
-from pdvc.measure import measure
 from pdvc.options import MeasureOptions
+from pdvc.protocol import measure
 from pdvc.settings import Settings
 from pdvc.store import Store, experiment_digest, reference_digest
 from validation.testing.small_cases import SmallExperiment, small_scenario

@@ -105,7 +105,7 @@ def one_line_errors(console: Console, *, resume: str, debug: bool = False) -> It
     except KeyboardInterrupt as error:
         _say(console, "; ".join(["interrupted", *_notes(error), *([] if _notes(error) else [resume])]))
         raise typer.Exit(INTERRUPTED) from None
-    except (ValueError, MemoryError, OSError) as error:
+    except (ValueError, MemoryError, OSError, ImportError) as error:
         if debug:
             raise
         _say(console, "; ".join([f"error: {_explain(error)}", *_notes(error)]))

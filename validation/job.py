@@ -31,7 +31,7 @@ from validation.report.page import write_report
 from validation.scoring.scores import Scores, score
 
 if TYPE_CHECKING:
-    from pdvc.measure import MeasureOptions
+    from pdvc.protocol import MeasureOptions
     from simulator.scenario import Scenario
 
 
@@ -156,7 +156,7 @@ def _measure(
         # one that was damaged since is made again
         with suppress(MeasurementError):
             return read_measurement(job.measurement), True
-    from pdvc.measure import measure
+    from pdvc.protocol import measure
 
     with _noting("measure", state, state_path):
         measurement = measure(experiment, job.options, progress=progress, work=job.work / "measure")

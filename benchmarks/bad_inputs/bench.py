@@ -144,7 +144,7 @@ class Bench:
         # the server imports once what every command needs; it computes nothing, so that forking it is safe
         self._processes = multiprocessing.get_context("forkserver")
         self._processes.set_forkserver_preload(
-            ["pdvc.measure", "validation.cli", "validation.report.page", "simulator.scanner"]
+            ["pdvc.protocol", "validation.cli", "validation.report.page", "simulator.scanner"]
         )
 
     def simulated(self, name: str) -> Path:

@@ -6,9 +6,9 @@ import numpy as np
 
 from pdvc.experiment import Experiment
 from pdvc.history import Force, Polynomial
-from pdvc.measure import measure
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions
+from pdvc.protocol import measure
 from validation.methods.registry import Method
 
 

@@ -212,7 +212,7 @@ class _Session:
         self._client, self._folder, self._shared = client, folder, shared
         self._total, self._progress = total, progress
         self._uses: Counter[str] = Counter()
-        self._parts: dict[str, Future] = {}
+        self._parts: dict[str, Future[Any]] = {}
         self._made: set[str] = set()
         self._failed = 0
         self._left = 0
@@ -247,12 +247,12 @@ class _Session:
             places.append(first.setdefault(rarest, place))
         return [runs[place] for place in sorted(range(len(runs)), key=lambda place: places[place])]
 
-    def _finished(self, runs: list[Run], window: Any) -> Iterator[tuple[Run, Future]]:
+    def _finished(self, runs: list[Run], window: Any) -> Iterator[tuple[Run, Future[Any]]]:
         """Submit runs, as many at a time as the window allows, and yield each when it is finished."""
         from distributed import as_completed
 
         waiting, finished = deque(enumerate(runs)), as_completed()
-        submitted: dict[Future, Run] = {}
+        submitted: dict[Future[Any], Run] = {}
         while waiting or submitted:
             while waiting and len(submitted) < window():
                 place, run = waiting.popleft()
@@ -266,7 +266,7 @@ class _Session:
         # one run more for each worker than it is busy with, so that it never waits
         return max(2 * sum(self._client.nthreads().values()), 4)
 
-    def _submit(self, run: Run, place: int) -> Future:
+    def _submit(self, run: Run, place: int) -> Future[Any]:
         parts = self._parts_in_work(run.parts(), place)
         # not the run's own key: dask would answer a second attempt with the first one's failure
         key = f"run-{uuid.uuid4().hex}"
@@ -274,7 +274,7 @@ class _Session:
             _carry_out, run, self._folder, self._shared, parts, key=key, priority=-place, pure=False
         )
 
-    def _parts_in_work(self, parts: tuple[Part, ...], place: int) -> list[Future]:
+    def _parts_in_work(self, parts: tuple[Part, ...], place: int) -> list[Future[Any]]:
         """Return the futures of those parts that several runs share and that are not made yet."""
         shared = [part for part in parts if self._uses[part.name] > 1 and part.name not in self._made]
         for part in shared:
@@ -285,7 +285,7 @@ class _Session:
                 )
         return [self._parts[part.name] for part in shared]
 
-    def _take(self, run: Run, future: Future) -> None:
+    def _take(self, run: Run, future: Future[Any]) -> None:
         """Take note of a run that is finished, or write its row where no worker could."""
         try:
             # waits where the worker has died since, for another to find the row on disk

@@ -34,10 +34,10 @@ from numpy.typing import NDArray
 from pdvc.deviations import Quantities
 from pdvc.digest import digest, software
 from pdvc.experiment import Experiment, read_experiment
-from pdvc.measure import measure
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions
 from pdvc.preparation import keep_volumes, volume_choices
+from pdvc.protocol import measure
 from simulator.clean import clean_file, clean_stack
 from simulator.scanner import simulate
 from simulator.scenario import Scenario

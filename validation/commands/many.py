@@ -163,7 +163,6 @@ def plan(
     """
     with answering() as progress:
         from validation.job import write_text
-        from validation.plan.designs import plan as work_out
         from validation.plan.designs import plan_experiment
         from validation.plan.tables import designs_csv, designs_table, weak_table
 
@@ -177,6 +176,7 @@ def plan(
             name, found = experiment.title or str(folder), plan_experiment(experiment, read, progress=progress)
         else:
             from simulator.scenario import load_scenario
+            from validation.plan.simulated import plan as work_out
 
             chosen = load_scenario(scenario)
             use_threads(threads)

@@ -9,9 +9,9 @@ import numpy as np
 from pdvc.experiment import Experiment
 from pdvc.gauss_newton import GaussNewton
 from pdvc.history import Steps
-from pdvc.measure import measure
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions, StageOptions, paper_options
+from pdvc.protocol import measure
 from pdvc.volume_correlation import correlate
 from validation.methods.registry import Method
 

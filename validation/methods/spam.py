@@ -32,12 +32,12 @@ from numpy.typing import NDArray
 
 from pdvc.experiment import Experiment
 from pdvc.history import Steps, time_basis
-from pdvc.measure import versions
 from pdvc.measurement import MeasuredMotion, Measurement, Provenance, Stage, unfitted
 from pdvc.options import MeasureOptions
 from pdvc.preparation import scan_volume
 from pdvc.prior import solved
 from pdvc.progress import silent
+from pdvc.protocol import versions
 from pdvc.radiographs import IDENTITY
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, outlined, set_up

@@ -29,8 +29,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.deviations import points_on_axis
 from pdvc.measurement import Measurement
-from validation.scoring.centre_line import TruePoints, measured_at, points_on_axis
+from validation.scoring.centre_line import TruePoints, measured_at
 from validation.scoring.scores import Directions
 
 Floats = NDArray[np.float64]

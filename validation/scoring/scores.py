@@ -117,7 +117,7 @@ class Errors:
     @property
     def scored(self) -> NDArray[np.bool_]:
         """Return which points (step, point) count."""
-        return np.all(np.isfinite(self.components), axis=2)
+        return np.asarray(np.all(np.isfinite(self.components), axis=2))
 
     def rms(self) -> Directions:
         """Return the rms over points and steps."""

@@ -122,7 +122,7 @@ def _variance(products: Floats) -> Floats:
 
 
 def _bias_square(products: Floats) -> Floats:
-    return np.maximum(_square_of_mean(products) - _variance(products) / products.shape[-1], 0)
+    return np.asarray(np.maximum(_square_of_mean(products) - _variance(products) / products.shape[-1], 0))
 
 
 def _with_interval(

@@ -27,11 +27,11 @@ from pdvc.experiment import Experiment, Series, read_experiment
 from pdvc.gauss_newton import GaussNewton
 from pdvc.geometry import ConeBeam
 from pdvc.history import PAPER, Angle, Polynomial, Ramp, time_basis
-from pdvc.measure import measure
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.pgd import Pgd
 from pdvc.projection import project
+from pdvc.protocol import measure
 from pdvc.rays import ray_vectors
 from pdvc.sections import RIGID, SectionBasis, names_of
 from pdvc.volume import Grid, Hull, Volume, hull_of
@@ -107,7 +107,7 @@ class SmallExperiment:
 
     @property
     def measurement(self) -> Measurement:
-        """Return what `pdvc.measure.measure` makes of the experiment."""
+        """Return what `pdvc.protocol.measure` makes of the experiment."""
         return _measured(self.scenario)
 
     def __repr__(self) -> str:
@@ -209,7 +209,7 @@ class ProjectedCase:
     @property
     def amplitude(self) -> Floats:
         """Return the true amplitudes (step, section, motion), voxels."""
-        return np.einsum("ft,fjk->tjk", self.time_functions, self.coefficients)
+        return np.asarray(np.einsum("ft,fjk->tjk", self.time_functions, self.coefficients))
 
     @property
     def volume(self) -> Volume:
