@@ -100,7 +100,8 @@ def _add_record(found: Any, record: Any, names: Any) -> None:
     _head(found, "record", type(record).__qualname__)
     if type(record).__module__.partition(".")[0] not in OWN:
         # what a user's own kind of time function, or solver, does is part of what it is
-        _head(found, "code", _code_of(type(record)))
+        kind: type = type(record)
+        _head(found, "code", _code_of(kind))
     for name in names:
         _add(found, name)
         _add(found, getattr(record, name))
