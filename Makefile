@@ -33,6 +33,27 @@ $(BIN)/python:
 		{ echo "expected Python 3.11 or later, found: $$($(PYTHON) --version 2>&1)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
+# build the site into build/docs: pages of docs/, the API from the docstrings, the picture of the rooms. Warnings are
+# errors, links and anchors are checked. Makes an environment of its own, with the extra `docs`
+.PHONY: docs
+docs: .venv-docs/.installed
+	.venv-docs/bin/python docs/figures/architecture.py
+	.venv-docs/bin/sphinx-build -q -W --keep-going -d build/doctrees -c docs/site docs build/docs
+	.venv-docs/bin/python docs/site/check.py build/docs
+
+.venv-docs/.installed: pyproject.toml
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	touch $@
+
+# which lines and branches the tests reach; the page is build/coverage/index.html. Longer than `make test`. Compiled
+# kernels do not show: their lines count as missed, though tests/test_projection.py and others go through them.
+# TESTS="tests/test_geometry.py" takes some files only
+.PHONY: coverage
+TESTS ?= tests
+coverage: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term:skip-covered --cov-report=html $(TESTS)
+
 # time every stage, beside RTK and beside a plain implementation: one table. Makes an environment of its own, with the
 # extra `bench` (itk-rtk, 1.75 GB installed); RTK itself takes half a minute to load, and the whole some ten minutes
 .PHONY: bench

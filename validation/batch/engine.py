@@ -264,7 +264,8 @@ class _Session:
 
     def _window(self) -> int:
         # one run more for each worker than it is busy with, so that it never waits
-        return max(2 * sum(self._client.nthreads().values()), 4)
+        threads: dict[str, int] = self._client.nthreads()
+        return max(2 * sum(threads.values()), 4)
 
     def _submit(self, run: Run, place: int) -> Future[Any]:
         parts = self._parts_in_work(run.parts(), place)
