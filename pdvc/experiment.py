@@ -199,12 +199,13 @@ class Experiment:
     """Full scans at some steps, in the order of the steps; only volume correlation looks at them."""
 
 
-def read_experiment(folder: Path, *, planned: bool = False) -> Experiment:
+def read_experiment(folder: Path | str, *, planned: bool = False) -> Experiment:
     """Open an experiment folder; the stacks stay on disk where their TIFF is uncompressed.
 
     `planned`: the test is still to be made, of which only angles, times and forces are known, and has no counts.
     Raises ExperimentError or SettingsError, in one line, for whatever is missing, truncated or inconsistent.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise ExperimentError(f"{folder}: expected an experiment folder, found none")
     description = Description.read(folder / DESCRIPTION)

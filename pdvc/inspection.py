@@ -12,7 +12,7 @@ from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
 from pdvc.equations import memory_bytes
 from pdvc.examination import Examination
 from pdvc.experiment import Experiment
-from pdvc.options import MeasureOptions
+from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.progress import Progress, silent
 from pdvc.projection import normal_equations
 from pdvc.rays import ray_vectors
@@ -42,7 +42,7 @@ class Inspection:
     doubts: tuple[Doubt, ...]
 
 
-def inspect(experiment: Experiment, options: MeasureOptions, *, progress: Progress = silent) -> Inspection:
+def inspect(experiment: Experiment, options: MeasureOptions = DEFAULT, *, progress: Progress = silent) -> Inspection:
     """Examine an experiment, outline the sample coarsely, and work out window and cost.
 
     Raises ValueError, in one line, where the data cannot be used.

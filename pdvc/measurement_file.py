@@ -136,8 +136,9 @@ def write_measurement(measurement: Measurement, path: Path) -> None:
     write_netcdf(path, data, packed)
 
 
-def read_measurement(path: Path) -> Measurement:
+def read_measurement(path: Path | str) -> Measurement:
     """Read a measurement file; raises MeasurementError where it is none."""
+    path = Path(path)
     if not path.is_file():
         raise MeasurementError(f"{path}: expected a measurement file, found none")
     try:

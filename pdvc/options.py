@@ -12,9 +12,19 @@ from pdvc.gauss_newton import GaussNewton
 from pdvc.geometry import ConeBeam
 from pdvc.history import PAPER, Ramp, TimeFunction, settled
 from pdvc.pgd import Pgd
-from pdvc.sections import CONTRACTION, RIGID, motions_named, names_of
-from pdvc.settings import Settings
+from pdvc.sections import CONTRACTION, RIGID, SectionPattern, motions_named, names_of
+from pdvc.settings import Settings, load_plugins
 from pdvc.solution import Solver
+
+
+def motions_of(names: tuple[str, ...]) -> tuple[SectionPattern, ...]:
+    """Return section motions by their names, also those that installed packages offer; raises ValueError else."""
+    try:
+        return motions_named(names)
+    except ValueError:
+        load_plugins()
+        return motions_named(names)
+
 
 COARSE_ROWS = 100
 """Rows that the coarse scale leaves at least."""
@@ -107,7 +117,7 @@ class MeasureOptions(Settings):
     @field_validator("section_motions")
     @classmethod
     def _known_motions(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        motions_named(names)  # raises if one is unknown
+        motions_of(names)  # raises if one is unknown
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"every motion once, {', '.join(twice)} stands there twice")
@@ -169,5 +179,6 @@ def paper_options() -> MeasureOptions:
     )
 
 
+DEFAULT = MeasureOptions()
 PROTOCOLS: dict[str, Callable[[], MeasureOptions]] = {"default": MeasureOptions, "paper": paper_options}
 """Built-in options by name."""

@@ -25,7 +25,7 @@ from pdvc.experiment import Experiment
 from pdvc.history import settled
 from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Stage
 from pdvc.noise import known_from_residual, propagate
-from pdvc.options import MeasureOptions, ResolvedStage, StageOptions
+from pdvc.options import DEFAULT, MeasureOptions, ResolvedStage, StageOptions
 from pdvc.preparation import Prepared, noise_of, prepare, snr_of
 from pdvc.progress import Progress, silent
 from pdvc.result_checks import check_finite, doubts_of_result
@@ -42,7 +42,7 @@ Floats = NDArray[np.float64]
 
 
 def measure(
-    experiment: Experiment, options: MeasureOptions, *, progress: Progress = silent, work: Path | None = None
+    experiment: Experiment, options: MeasureOptions = DEFAULT, *, progress: Progress = silent, work: Path | None = None
 ) -> Measurement:
     """Measure the motion of the sample in an experiment.
 

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from pdvc.experiment import Experiment
 from pdvc.lock import held
 from pdvc.measurement import Measurement
 from pdvc.measurement_file import write_measurement
+from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.progress import Progress, silent
-
-if TYPE_CHECKING:
-    from pdvc.experiment import Experiment
-    from pdvc.options import MeasureOptions
+from pdvc.protocol import measure
 
 
 def measure_into(
-    file: Path,
+    file: Path | str,
     experiment: Experiment,
-    options: MeasureOptions,
+    options: MeasureOptions = DEFAULT,
     *,
     work: Path | None = None,
     progress: Progress = silent,
@@ -31,8 +29,7 @@ def measure_into(
     Raises ValueError for data that cannot be used, or whose result is not finite, InUseError where another process is
     at the same file.
     """
-    from pdvc.protocol import measure
-
+    file = Path(file)
     folder = work or file.with_name(file.name + ".work")
     new = not folder.exists()
     with held(folder):

@@ -6,6 +6,8 @@ import json
 import math
 import tomllib
 from collections.abc import Iterator
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -13,6 +15,8 @@ import tomlkit
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, PydanticKnownError, core_schema
 
+PLUGINS = "pdvc_bench.plugins"
+"""Entry points of modules that offer further time functions, solvers and section motions when they are loaded."""
 LARGEST = 1e15
 """Size that no number of a record exceeds, whatever its unit: squares and products of such numbers are finite."""
 
@@ -109,17 +113,30 @@ class Choice(Settings):
         if isinstance(value, cls):
             return value
         if not isinstance(value, dict):
-            kinds = " or ".join(repr(name) for name in cls._kinds)
+            kinds = " or ".join(repr(name) for name in sorted(cls._kinds))
             raise PydanticCustomError("choice", "a table with the kind {kinds}", {"kinds": kinds})
         if "kind" not in value:
             raise PydanticKnownError("union_tag_not_found", {"discriminator": "'kind'"})
-        kind = cls._kinds.get(str(value["kind"]))
+        name = str(value["kind"])
+        if name not in cls._kinds:
+            load_plugins()
+        kind = cls._kinds.get(name)
         if kind is None:
-            expected = ", ".join(repr(name) for name in cls._kinds)
-            context = {"discriminator": "'kind'", "tag": str(value["kind"]), "expected_tags": expected}
+            expected = ", ".join(repr(name) for name in sorted(cls._kinds))
+            context = {"discriminator": "'kind'", "tag": name, "expected_tags": expected}
             raise PydanticKnownError("union_tag_invalid", context)
         # strict validation takes a list for a tuple only from JSON
         return kind.model_validate_json(json.dumps(value))  # type: ignore[return-value]
+
+
+@cache
+def load_plugins() -> None:
+    """Import what installed packages announce as the entry points `pdvc_bench.plugins`: modules with further kinds.
+
+    Done only where a name is asked for that nothing loaded so far offers.
+    """
+    for entry in entry_points(group=PLUGINS):
+        entry.load()
 
 
 def read_toml(path: Path) -> dict[str, Any]:

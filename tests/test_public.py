@@ -1,0 +1,258 @@
+"""The door for Python: the public names are pinned, load late, and do what the pages of the documentation say."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdvc
+from pdvc.history import TimeFunction, time_basis
+from pdvc.options import MeasureOptions, StageOptions
+from pdvc.plan import PlannedTest
+from pdvc.sections import SectionBasis
+from pdvc.settings import SettingsError
+from simulator.scanner import simulate
+from tests import synthetic_records as records
+from tests.tiny_scenarios import TINY
+from validation.testing.small_cases import SmallExperiment, small_scenario
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+
+
+def blocks(page):
+    return re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_the_public_names_are_these():
+    """A change here is a change for everyone who uses the package: say so in the changelog."""
+    assert pdvc.__all__ == [
+        "Experiment",
+        "MeasureOptions",
+        "Measurement",
+        "dataset_of",
+        "displacement",
+        "inspect",
+        "measure",
+        "measure_into",
+        "paper_options",
+        "plot",
+        "read_experiment",
+        "read_measurement",
+        "strain",
+    ]
+    for name in pdvc.__all__:
+        found = getattr(pdvc, name)
+        assert found is getattr(pdvc, name)  # not shadowed by a module once that is loaded
+        assert callable(found)
+        assert inspect.getdoc(found)
+        assert name in dir(pdvc)
+    with pytest.raises(AttributeError, match="no attribute 'displacements'"):
+        _ = pdvc.displacements
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    code = "import sys, pdvc; print([name for name in ('numpy', 'numba', 'matplotlib') if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_the_walk_through_runs(tmp_path, monkeypatch, capsys):
+    small = small_scenario({})
+    simulate(small, tmp_path / "experiment")
+    monkeypatch.chdir(tmp_path)
+    session: dict[str, object] = {}
+    for block in blocks("walkthrough.md"):
+        exec(compile(block, "page", "exec", dont_inherit=True), session)
+    told = capsys.readouterr().out
+    assert "largest strain of the last step" in told
+    assert (tmp_path / "motion.png").stat().st_size > 10_000
+    assert (tmp_path / "amplitudes.nc").is_file()
+    assert not (tmp_path / "motion.nc.work").exists()
+    # beside the record's own numbers, in voxels
+    measured, moved = session["measured"], session["moved"]
+    voxel_mm = measured.recording.voxel_mm
+    expected = measured.motion.displacement(3, np.array(session["points"])) * voxel_mm
+    np.testing.assert_allclose(moved["displacement"].sel(step=3), expected)
+
+
+@pytest.fixture(scope="module")
+def added():
+    """Run the blocks of the how-to page once: kinds are offered for the whole process."""
+    session: dict[str, object] = {"__name__": "added_by_the_page"}
+    for block in blocks("extend.md"):
+        exec(compile(block, "page", "exec", dont_inherit=True), session)
+    return session
+
+
+def test_a_time_function_is_added_by_the_page_alone(added, tmp_path):
+    creep = added["Creep"]
+    assert creep in TimeFunction.kinds()
+    path = tmp_path / "options.toml"
+    path.write_text('[[time]]\nkind = "force"\n[[time]]\nkind = "creep"\nstart = 12\n')
+    options = MeasureOptions.read(path)
+    assert options.time[1] == creep(start=12)
+    assert "logarithm of the time since a step" in options.template()
+    small = SmallExperiment(small_scenario({}))
+    options = small.options.model_copy(update={"time": (*small.options.time, creep(start=12))})
+    measured = pdvc.measure(small.experiment, options)
+    series = small.experiment.test
+    since = np.clip(series.time_s - series.time_s[12], 0, None)
+    functions = measured.motion.time_functions
+    wanted = np.log1p(since / 5.0)
+    held = functions.T @ (functions @ wanted) / len(wanted)
+    np.testing.assert_allclose(held, wanted, atol=1e-9)
+    assert len(functions) == len(time_basis(small.options.time, series)) + 1
+    assert creep(start=12).stretched(2.0).start == 24
+
+
+def test_a_section_motion_is_added_by_the_page_alone(added, tmp_path):
+    shear = added["SHEAR"]
+    small = SmallExperiment(small_scenario({}))
+    options = MeasureOptions(
+        **{**dict(small.options), "section_motions": (*small.options.section_motions, "shear_xy")}
+    )
+    pdvc.measure_into(tmp_path / "motion.nc", small.experiment, options)
+    measured = pdvc.read_measurement(tmp_path / "motion.nc")
+    assert measured.motion.basis.motions[-1] == shear
+    # the sample does not shear, and no fit would say so exactly
+    z = measured.motion.amplitude[..., -1] / measured.motion.amplitude_std[..., -1]
+    assert 0 < np.sqrt((z**2).mean()) < 4
+
+
+def test_a_solver_is_added_by_the_page_alone(added, tmp_path):
+    path = tmp_path / "options.toml"
+    (toml,) = [text for text in re.findall(r"```toml\n(.*?)```", (DOCS / "extend.md").read_text(), re.DOTALL)
+               if "one-step" in text]  # fmt: skip
+    path.write_text(toml)
+    options = MeasureOptions.read(path)
+    assert options.deformation == (StageOptions(scale=1, solver=added["OneStep"]()),)
+    small = SmallExperiment(small_scenario({}))
+    measured = pdvc.measure(small.experiment, small.options.model_copy(update={"deformation": options.deformation}))
+    assert measured.fit.stages[-1].solver == "one-step"
+    assert len(measured.fit.stages[-1].rms) == 2
+
+
+def test_an_unknown_kind_is_answered_with_the_known_ones():
+    with pytest.raises(SettingsError, match=r"solver: unknown kind 'newton', expected 'gauss-newton'.*'pgd'"):
+        MeasureOptions.parse({"deformation": [{"scale": 1, "solver": {"kind": "newton"}}]}, where="options")
+    with pytest.raises(
+        SettingsError, match=r"solver: expected a table with the kind 'gauss-newton' or .* given 'pgd'"
+    ):
+        MeasureOptions.parse({"deformation": [{"scale": 1, "solver": "pgd"}]}, where="options")
+    with pytest.raises(SettingsError, match=r"deformation\.0\.solver\.most: unknown key"):
+        MeasureOptions.parse({"deformation": [{"solver": {"kind": "pgd", "most": 3}}]}, where="options")
+    with pytest.raises(SettingsError, match=r"solver\.most_modes: unknown key"):
+        MeasureOptions.parse({"deformation": [{"solver": {"kind": "gauss-newton", "most_modes": 3}}]}, where="options")
+
+
+def test_a_kind_is_offered_by_one_record_only(added):
+    with pytest.raises(TypeError, match="kind 'creep': expected one record of this kind"):
+        type("Other", (TimeFunction,), {"__annotations__": {"kind": str}, "kind": "creep", "__module__": "elsewhere"})
+
+
+@pytest.fixture(scope="module")
+def stretched():
+    strain, offset = records.tensile_history()
+    _, amplitude = records.stretched(strain, offset)
+    return records.measurement(amplitude), strain, offset
+
+
+class TestPoints:
+    def test_displacements_are_those_of_the_closed_form_in_mm(self, stretched):
+        """x = X + e Z e_z + d: u(x) = d + e / (1 + e) (z - d_z) e_z."""
+        measured, strain, offset = stretched
+        points = np.array([[0.0, 0.0, 1.0], [0.3, -0.2, -2.0]])
+        found = pdvc.displacement(measured, points, steps=(5, 20))
+        for k, step in enumerate((5, 20)):
+            rise = strain[step] / (1 + strain[step]) * (points[:, 2] - offset[step, 2])
+            expected = offset[step] + np.stack([0 * rise, 0 * rise, rise], axis=1)
+            np.testing.assert_allclose(found["displacement"][k], expected, atol=1e-12)
+            angle = measured.recording.angle_rad[step]
+            across, along = np.array([-np.sin(angle), -np.cos(angle)]), np.array([np.cos(angle), -np.sin(angle)])
+            np.testing.assert_allclose(found["turned"][k, :, 0], expected[:, :2] @ across)
+            np.testing.assert_allclose(found["turned"][k, :, 2], expected[:, :2] @ along)
+        expected = measured.turned_std(5, points) * records.VOXEL_MM
+        np.testing.assert_allclose(found["deviation"][0], expected)
+        assert found["deviation"].attrs["units"] == "mm"
+
+    def test_strains_are_of_the_length_at_rest(self, stretched):
+        measured, strain, _ = stretched
+        found = pdvc.strain(measured, [-2.0, -0.5, 2.0])
+        np.testing.assert_allclose(found["strain"], np.repeat(strain[:, None], 2, axis=1), atol=1e-12)
+        # a small change of the slope, by the strain's own formula
+        slope = strain[20] / (1 + strain[20])
+        change = 1e-6
+        expected = ((slope + change) / (1 - slope - change) - strain[20]) / change
+        of_slope = measured.strain_std(20, np.array([-2.0, -0.5, 2.0]))
+        np.testing.assert_allclose(found["deviation"][20], expected * of_slope, rtol=1e-4)
+
+    def test_what_was_not_observed_is_not_a_number(self):
+        measured = records.measurement(np.ones((records.STEPS, 9, 6)), unobserved=(8,))
+        found = pdvc.displacement(measured, [[0.0, 0.0, 3.5], [0.0, 0.0, 0.0]])
+        assert np.isnan(found["displacement"][:, 0]).all()
+        assert np.isnan(found["deviation"][:, 0]).all()
+        assert np.isfinite(found["deviation"][:, 1]).all()
+        assert np.isnan(pdvc.strain(measured)["strain"][:, -1]).all()
+        pdvc.plot(measured).draw_without_rendering()
+
+    @pytest.mark.parametrize(
+        ("call", "told"),
+        [
+            (lambda m: pdvc.displacement(m, [0.0, 0.0, 1.0]), r"points_mm: expected \(point, 3\)"),
+            (lambda m: pdvc.displacement(m, [[0.0, 0.0, 1.0]], steps=[99]), "steps: expected some of 0 to 23"),
+            (lambda m: pdvc.displacement(m, [[0.0, 0.0, 1.0]], steps=[]), "steps: expected some of 0 to 23"),
+            (lambda m: pdvc.strain(m, [1.0, 1.0]), "heights_mm: expected two or more, increasing"),
+        ],
+    )
+    def test_wrong_questions_are_answered_in_one_line(self, stretched, call, told):
+        with pytest.raises(ValueError, match=told) as caught:
+            call(stretched[0])
+        assert "\n" not in str(caught.value)
+
+
+def test_sections_that_cannot_follow_a_rigid_motion_say_so_and_the_rigid_stage_leaves_it_out():
+    basis = SectionBasis(height_mm=np.array([-1.0, 1.0]), radius_mm=0.5, motions=SectionBasis.__dataclass_fields__[
+        "motions"].default[:3])  # fmt: skip
+    whole = SectionBasis(height_mm=np.array([0.0]), radius_mm=0.5)
+    with pytest.raises(ValueError, match="section motions: expected motions that can follow"):
+        basis.reproduced(np.eye(6)[5][None], whole)
+    small = SmallExperiment(small_scenario({}))
+    names = ("translation_x", "translation_y", "translation_z", "rotation_z")
+    measured = pdvc.measure(small.experiment, MeasureOptions(**{**dict(small.options), "section_motions": names}))
+    assert measured.fit.stages[0].spatial.shape[2] == 4
+
+
+def test_a_planned_test_needs_no_counts():
+    nothing = np.zeros(4)
+    test = PlannedTest(angle_rad=nothing, time_s=nothing, force_N=nothing, moved_mm=np.zeros((4, 3)))
+    assert len(test.recorded()) == 4
+
+
+def test_a_laboratory_plans_from_its_reference_scan(tmp_path):
+    """The folder of an experiment whose test is still to be made: its radiographs are not there."""
+    from tests.command_line import pdvc_bench
+
+    (tmp_path / "tiny.toml").write_text(TINY)
+    assert pdvc_bench("simulate", tmp_path / "tiny.toml", "-o", tmp_path / "experiment").exit_code == 0
+    (tmp_path / "experiment" / "test" / "radiographs.tif").unlink()
+    found = pdvc_bench("plan", tmp_path / "experiment", "-o", tmp_path / "real.csv")
+    assert found.exit_code == 0, found.stderr
+    simulated = pdvc_bench("plan", tmp_path / "tiny.toml", "-o", tmp_path / "simulated.csv")
+    assert simulated.exit_code == 0, simulated.stderr
+
+    def own(name):
+        heads, first, *_ = (line.split(",") for line in (tmp_path / name).read_text().splitlines())
+        return dict(zip(heads, map(float, first), strict=True))
+
+    real, known = own("real.csv"), own("simulated.csv")
+    assert real["steps"] == known["steps"]
+    # the same reference scan, with noise and without; points of the hull for those of the specimen
+    assert real["std_across_beam"] == pytest.approx(known["std_across_beam"], rel=0.3)
+    assert real["std_vertical"] == pytest.approx(known["std_vertical"], rel=0.3)
