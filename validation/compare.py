@@ -29,7 +29,7 @@ from pdvc.progress import Progress, silent
 from pdvc.settings import SettingsError
 from simulator.clean import clean_file
 from simulator.scenario import Scenario
-from simulator.views import stacks_of
+from simulator.stacks import stacks_of
 from validation.compare_report import write_comparison
 from validation.cost import cost_of_projections, cost_of_stack, cost_of_volumes
 from validation.methods import LooksAt, Method, find_method

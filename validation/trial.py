@@ -40,8 +40,8 @@ from pdvc.preparation import keep_volumes, volume_choices
 from simulator.clean import clean_file, clean_stack
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
+from simulator.stacks import Stack, stacks_of
 from simulator.truth import Truth, read_truth
-from simulator.views import Stack, stacks_of
 from validation.axis import axis_history
 from validation.bound import kept_bound
 from validation.calibration import Quantities
