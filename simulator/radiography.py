@@ -34,7 +34,7 @@ from pdvc.geometry import ConeBeam
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Hold the deformed object in the sample frame, as the stage sees it at angle 0."""
+    """The deformed object in the sample frame, as the stage sees it at angle 0."""
 
     vertices_mm: NDArray[np.float64]
     """Vertices (v, 3) of the closed surface of the matrix, mm."""
@@ -98,7 +98,7 @@ def _check_depth(depth_mm: NDArray[np.float64], geometry: ConeBeam, angle_rad: f
 
 @dataclass(frozen=True)
 class _Screen:
-    """Be the sub-pixel grid: number q of a centre <-> place (a, b) on the detector <-> ray."""
+    """The sub-pixel grid: number q of a centre <-> place (a, b) on the detector <-> ray."""
 
     rows: int
     columns: int
