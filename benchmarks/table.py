@@ -20,10 +20,11 @@ from pdvc.experiment import read_experiment
 from pdvc.projection import normal_equations
 from pdvc.protocol import MeasureOptions, measure
 from pdvc.reconstruction import fdk
+from simulator.images import prepare
 from simulator.radiography import path_lengths
 from simulator.scanner import simulate
 from simulator.scenario import course_of, load_scenario
-from simulator.views import prepare, step_image, view_image
+from simulator.stacks import step_image, view_image
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]

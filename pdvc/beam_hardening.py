@@ -35,7 +35,7 @@ _FIT_VIEWS = 24
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """Hold what the coarse reconstruction tells."""
+    """What the coarse reconstruction tells."""
 
     hull: Hull
     """Encloses the sample, with a margin of two coarse voxels."""

@@ -27,7 +27,7 @@ COPIES = 10
 
 @dataclass(frozen=True, kw_only=True)
 class Images:
-    """Hold the radiographs of one scale, and the volume that is to be matched with them."""
+    """The radiographs of one scale, and the volume that is to be matched with them."""
 
     rays: Floats
     """RayVectors.stacked() of the used window (step, 4, 3), mm."""
@@ -49,7 +49,7 @@ class Images:
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """Hold B(t), c(t) and the residual at one trial motion."""
+    """B(t), c(t) and the residual at one trial motion."""
 
     matrix: Floats
     """B (step, section * motion, section * motion)."""

@@ -46,7 +46,7 @@ _BLOCK_ROWS = 16
 
 @dataclass(frozen=True, kw_only=True)
 class ImageNoise:
-    """Hold the noise of one image: grey levels."""
+    """The noise of one image, in grey levels."""
 
     variance: Image
     """Its own, of photons and readout (row, column)."""
@@ -56,7 +56,7 @@ class ImageNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Hold the noise of all images of one scale; images are asked for one at a time."""
+    """The noise of all images of one scale; images are asked for one at a time."""
 
     step: Callable[[int], ImageNoise]
     """Of a step's radiograph, over the window."""
@@ -88,7 +88,7 @@ def known_from_residual(rms: float, window: tuple[int, int], detector: tuple[int
 
 @dataclass(frozen=True, kw_only=True)
 class Propagated:
-    """Hold the covariance V of h."""
+    """The covariance V of h, and whether the residual is that noise."""
 
     parts: Mapping[str, Floats]
     """By source, ``radiographs``, ``views`` and ``flats``: (function * unknown, function * unknown), or (function,
@@ -191,7 +191,8 @@ def _users(systematic: Systematic) -> tuple[dict[int, list[int]], dict[int, int]
 
 def _share(systematic: Systematic, step: int, view: int) -> float:
     share = float(systematic.share[step])
-    return (1 - share) * (systematic.first[step] == view) + share * (systematic.second[step] == view)
+    found: float = (1 - share) * (systematic.first[step] == view) + share * (systematic.second[step] == view)
+    return found
 
 
 def _between(noise: Noise, systematic: Systematic, step: int) -> ImageNoise:
@@ -258,7 +259,7 @@ def _scaled(blocks: Floats, time_functions: Floats) -> Floats:
 
 
 class Pile:
-    """Sum z = sum_t sigma(t) (x) field(t) in each pixel of the detector: what a noise meets that all images share."""
+    """The sums z = sum_t sigma(t) (x) field(t) in each pixel of the detector: what a noise meets that all share."""
 
     def __init__(self, shape: tuple[int, ...], time_functions: Floats, motions: int) -> None:
         """Begin with nothing on a detector of `shape`, for time functions (function, step)."""
@@ -315,7 +316,7 @@ class Pile:
 
 
 class _Tests:
-    """Sum what tells whether the residual is the noise that is expected."""
+    """The sums that tell whether the residual is the noise that is expected."""
 
     def __init__(self, overlap: Floats) -> None:
         self._overlap = overlap
@@ -407,12 +408,15 @@ def _add_product(one, first, other, second, variance, out):  # type: ignore[no-u
     A row may have room for sections beyond the last: these are left out.
     """
     for row in range(one.shape[0]):
+        # the pixels of a row share their sections: they are added up in a small matrix of their own, in double
+        # precision, which is added to its place in the large one when the row is done
         i0, j0 = first[row], second[row]
         height, width = min(one.shape[2], out.shape[0] - i0), min(other.shape[2], out.shape[1] - j0)
         part = np.zeros((height, width))
         for column in range(one.shape[1]):
             for i in range(height):
                 w = variance[row, column] * one[row, column, i]
+                # most are zero: air, and sections of the row that this ray does not meet
                 if w != 0:
                     for j in range(width):
                         part[i, j] += w * other[row, column, j]
@@ -423,11 +427,15 @@ def _add_product(one, first, other, second, variance, out):  # type: ignore[no-u
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
-    """Add each pixel's values to the four pixels that it was interpolated from; the adjoint of `_bilinear`."""
+    """Add each pixel's values to the four pixels that it was interpolated from; the adjoint of `_bilinear`.
+
+    One thread: neighbours add to the same pixels, and always in this order.
+    """
     rows, columns = out.shape[0], out.shape[1]
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
             r, c = places[row, column]
+            # limits and shares as in `systematic._bilinear`, or it would not be the adjoint
             if r < -0.01 or r > rows - 0.99 or c < -0.01 or c > columns - 0.99:
                 continue
             i, j = min(max(int(r), 0), rows - 2), min(max(int(c), 0), columns - 2)
@@ -435,6 +443,7 @@ def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
             for di in range(2):
                 for dj in range(2):
                     share = np.float32((a if di else 1 - a) * (b if dj else 1 - b))
+                    # where the sections of this row of the window begin in that row of the detector
                     start = offset[row, i + di]
                     for k in range(values.shape[2]):
                         out[i + di, j + dj, start + k] += share * values[row, column, k]
@@ -446,8 +455,10 @@ def _pile_up(z, row0, column0, values, offset, factor, sigma):  # type: ignore[n
     size = values.shape[2]
     scaled = np.empty(size, dtype=np.float32)
     for row in range(values.shape[0]):
+        # unsigned: numba need not ask whether an index counts from the end
         start = np.uint32(offset[row])
         for column in range(values.shape[1]):
+            # the product that all functions share is taken once, and pixels in air are left out
             largest = np.float32(0)
             for k in range(size):
                 scaled[k] = factor[row, column] * values[row, column, k]

@@ -30,7 +30,7 @@ IDENTITY = (1.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """Hold what turns the counts of one detector into grey levels."""
+    """What turns the counts of one detector into grey levels."""
 
     dark: Image
     """Mean dark (row, column), counts."""
@@ -95,7 +95,7 @@ def grey_levels(counts: NDArray[np.uint16] | Image, calibration: Calibration) ->
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorNoise:
-    """Hold the noise of a detector: what a mean of `frames` images holds of photons and readout."""
+    """The noise of a detector: what a mean of `frames` images holds of photons and readout."""
 
     photons_per_count: float
     readout_noise_counts: float

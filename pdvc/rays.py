@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class RayVectors:
-    """Hold, for each angle, the vectors that span the rays: pixel (r, c) is at corner + r row + c column."""
+    """The vectors that span the rays at each angle: pixel (r, c) is at corner + r row + c column."""
 
     source_mm: Floats
     """Source (angle, 3), mm."""

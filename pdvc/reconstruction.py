@@ -156,14 +156,18 @@ def _columns_inside(grid: Grid, hull: Hull) -> tuple[NDArray[np.bool_], NDArray[
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
 def _blend(one, two, f, first, last, out):  # type: ignore[no-untyped-def]
+    """Interpolate between two detector columns, over the rows first <= r < last."""
     for r in range(first, last):
         out[r] = one[r] + f * (two[r] - one[r])
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
 def _add_slab(out, line, first, last, r0, dr, top, weight):  # type: ignore[no-untyped-def]
+    """Add what the voxels first <= k < last of a column see: row r0 + k dr of a detector column."""
     for k in range(first, last):
+        # beyond the detector its edge goes on; a scan's grid is only as high as every view sees, to a voxel or so
         r = min(max(r0 + np.float32(k) * dr, np.float32(0)), top)
+        # unsigned: numba need not ask whether an index counts from the end
         i = np.uint32(r)
         low = line[i]
         out[k] += weight * (low + (r - np.float32(i)) * (line[i + np.uint32(1)] - low))
@@ -171,13 +175,20 @@ def _add_slab(out, line, first, last, r0, dr, top, weight):  # type: ignore[no-u
 
 @njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 def _back_project(out, views, beam, across, origin, voxel, distances, shift, inside, first):  # type: ignore[no-untyped-def]
-    """Add a batch of filtered views (view, column, row) to the volume (y, x, z)."""
+    """Add a batch of filtered views (view, column, row) to the volume (y, x, z).
+
+    A column of voxels along z has one depth U and one detector column u in each view, as the detector is level: its
+    two neighbouring detector columns are blended once, and the rows follow in equal steps. So z comes last in the
+    volume and rows last in the views, and both are walked through memory in order. A task adds all views of the batch,
+    in order, to its own y: no two write to the same voxel, and the result does not depend on the threads.
+    """
     ny, nx = out.shape[:2]
     columns, rows = views.shape[1], views.shape[2]
     source, detector, pixel = distances
     for j in prange(ny):
         line = np.empty(rows, np.float32)
         for i in range(nx):
+            # voxels low <= k < high hold all of the hull in this column
             low, high = -1, -1
             for slab in range(inside.shape[2]):
                 if inside[j, i, slab] and first[slab + 1] > first[slab]:
@@ -190,12 +201,14 @@ def _back_project(out, views, beam, across, origin, voxel, distances, shift, ins
             for n in range(views.shape[0]):
                 depth = source + x * beam[n, 0] + y * beam[n, 1]
                 scale = detector / (depth * pixel)
+                # places on the detector are counted in pixels from the centre of its first one
                 u = (x * across[n, 0] + y * across[n, 1]) * scale - shift[0] / pixel + 0.5 * (columns - 1)
                 if u < 0 or u >= columns - 1:
                     continue
                 c = int(u)
                 r0 = -origin[2] * scale - shift[1] / pixel + 0.5 * (rows - 1)
                 dr = -voxel * scale
+                # rows count downwards, so that dr < 0; only rows that some voxel looks at are blended
                 r_from = max(int(r0 + dr * (high - 1)) - 1, 0)
                 r_to = min(int(max(r0 + dr * low, 0.0)) + 3, rows)
                 if r_from >= r_to:

@@ -25,7 +25,7 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbours:
-    """Hold, for each step, the two reference views next to its angle and the share of the second."""
+    """The two reference views next to each step's angle, and the share of the second."""
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
@@ -52,7 +52,7 @@ def neighbouring_views(reference_rad: Floats, test_rad: Floats) -> Neighbours:
 
 @dataclass(frozen=True, kw_only=True)
 class Systematic:
-    """Hold e at the reference views that the steps need."""
+    """e at the reference views that the steps need."""
 
     fields: Image
     """e (field, row, column), grey levels, over the whole detector; zero where the volume does not reach."""

@@ -16,7 +16,7 @@ DIRECTIONS = 16
 
 @dataclass(frozen=True, kw_only=True)
 class Hull:
-    """Bound the sample slab by slab along z with a convex polygon: {(x, y): n_k . (x, y) <= support_k}.
+    """A bound of the sample, slab by slab along z a convex polygon: {(x, y): n_k . (x, y) <= support_k}.
 
     n_k are unit vectors at angles 2 pi k / DIRECTIONS. Slab i covers z_mm + i slab_mm .. z_mm + (i + 1) slab_mm.
     """
@@ -79,7 +79,7 @@ def hull_of(inside: NDArray[np.bool_], grid: Grid, slab_voxels: int) -> Hull:
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Place voxels: the centre of voxel (k, j, i) is at origin + voxel (i, j, k)."""
+    """The places of voxels: the centre of voxel (k, j, i) is at origin + voxel (i, j, k)."""
 
     shape: tuple[int, int, int]
     """(z, y, x)"""
@@ -107,7 +107,7 @@ class Grid:
 
 @dataclass(frozen=True, kw_only=True)
 class Volume:
-    """Hold the attenuation F of one state, usually the reference, in grey levels per mm, zero outside the hull."""
+    """The attenuation F of one state, usually the reference, in grey levels per mm, zero outside the hull."""
 
     values: NDArray[np.float32]
     """(z, y, x), grey levels per mm; one layer of zeros on every face."""

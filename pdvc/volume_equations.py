@@ -44,7 +44,7 @@ BLOCK_VOXELS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class VolumePair:
-    """Hold two volumes of one scale that are to be matched."""
+    """Two volumes of one scale that are to be matched."""
 
     reference: Volume
     """F, on any grid."""
@@ -64,7 +64,7 @@ class VolumePair:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Hold what a trial motion leaves: the sums over each layer, and the weights that make equations of them."""
+    """What a trial motion leaves: the sums over each layer, and the weights that make equations of them."""
 
     weights: Floats
     """W (layer, section * motion, 9): from moments to sensitivities."""
@@ -176,7 +176,10 @@ def _in_layers(affine: Floats, z_mm: Floats) -> Floats:
 def _compare_layers(  # type: ignore[no-untyped-def]
     reference, deformed, used, place, target, moved, voxel_mm, edge, blocks_x, moments, blocks, chi2, residual
 ):
-    """Compare layer by layer: a layer is one task, and its sums are in one order, whatever the threads."""
+    """Compare layer by layer: a layer is one task, and its sums are in one order, whatever the threads.
+
+    A task writes to its own layer of each result, and to nothing else.
+    """
     for k in prange(deformed.shape[0]):
         _compare_layer(
             reference,
@@ -200,6 +203,10 @@ def _compare_layers(  # type: ignore[no-untyped-def]
 def _compare_layer(  # type: ignore[no-untyped-def]
     reference, deformed, used, place, z, target, moved, voxel_mm, edge, blocks_x, moments, blocks, chi2, residual
 ):
+    """Add the voxels of one layer; `moved` (3, 3) takes (x, y, 1) to u there, mm.
+
+    `place` and `target` hold the centre of voxel (0, 0, 0) and the voxel of G's and F's grid, mm.
+    """
     nz, ny, nx = reference.shape
     m, step = np.empty(9), target[3]
     for j in range(deformed.shape[0]):
@@ -213,7 +220,9 @@ def _compare_layer(  # type: ignore[no-untyped-def]
             b = (y - moved[1, 0] * x - moved[1, 1] * y - moved[1, 2] - target[1]) / step
             c = (z - moved[2, 0] * x - moved[2, 1] * y - moved[2, 2] - target[2]) / step
             value, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
+            # air where the voxel comes from beside F's grid
             if 0 <= a < nx - 1 and 0 <= b < ny - 1:
+                # F's lowest and highest layer are empty: between the next ones it is known, beyond them they go on
                 low, high = 1.0, nz - 2.0
                 height = min(max(c, low), high)
                 p, q, r = int(a), int(b), min(int(height), nz - 3)
@@ -222,6 +231,7 @@ def _compare_layer(  # type: ignore[no-untyped-def]
                 d010, d011 = reference[r, q + 1, p], reference[r, q + 1, p + 1]
                 d100, d101 = reference[r + 1, q, p], reference[r + 1, q, p + 1]
                 d110, d111 = reference[r + 1, q + 1, p], reference[r + 1, q + 1, p + 1]
+                # along x, then y, then z; the derivatives are those of this interpolation
                 e00, e01 = d000 + fa * (d001 - d000), d010 + fa * (d011 - d010)
                 e10, e11 = d100 + fa * (d101 - d100), d110 + fa * (d111 - d110)
                 f0, f1 = e00 + fb * (e01 - e00), e10 + fb * (e11 - e10)
@@ -230,16 +240,19 @@ def _compare_layer(  # type: ignore[no-untyped-def]
                     (1 - fb) * (d101 - d100) + fb * (d111 - d110)
                 )
                 gy = (1 - fc) * (e01 - e00) + fc * (e11 - e10)
+                # what goes on unchanged has no slope along z
                 if low <= c <= high:
                     gz = f1 - f0
             rho = value - deformed[j, i]
             residual[j, i] = rho
             chi2[0] += rho * rho
+            # from a voxel of F to a unit amplitude: grey levels / mm / voxel
             scale = voxel_mm / step
             gx, gy, gz = gx * scale, gy * scale, gz * scale
             m[0], m[1], m[2] = gx * x, gx * y, gx
             m[3], m[4], m[5] = gy * x, gy * y, gy
             m[6], m[7], m[8] = gz * x, gz * y, gz
+            # m rho by blocks: they add up to c, and tell its covariance; of m m^T the lower triangle
             block = (j // edge) * blocks_x + i // edge
             for row in range(9):
                 blocks[block, row] += m[row] * rho

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from pdvc.digest import digest, software
 from pdvc.progress import Progress, silent
+from simulator.images import prepare
 from simulator.scenario import Scenario, course_of
 from simulator.side_by_side import in_order
-from simulator.views import Stack, clear_images, image_count, prepare
+from simulator.stacks import Stack, clear_images, image_count
 from simulator.xray import read_spectrum
 
 _EVERY_IMAGE = ("subpixels", "exposure_samples", "exposure_share", "start_deg")

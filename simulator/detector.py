@@ -76,7 +76,7 @@ class Detector(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorMaps:
-    """Hold what differs from pixel to pixel, the same for all images; each (rows, columns)."""
+    """What differs from pixel to pixel and is the same for all images; each (rows, columns)."""
 
     gain: NDArray[np.float32]
     """Counts per photon over the mean of all pixels."""
@@ -183,7 +183,7 @@ def pixel_means(image: NDArray[np.float32], subpixels: int, blur_px: float) -> N
     gauss = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2) if reach else np.ones(1)
     kernel = np.convolve(gauss / gauss.sum(), np.full(subpixels, 1 / subpixels)).astype(np.float32)
     across = _down_columns(np.ascontiguousarray(image), kernel, subpixels, reach)
-    return _down_rows(across, kernel, subpixels, reach)
+    return np.asarray(_down_rows(across, kernel, subpixels, reach))
 
 
 def _photons(image: NDArray[np.float32], detector: Detector, maps: DetectorMaps) -> NDArray[np.float32]:

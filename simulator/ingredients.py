@@ -9,38 +9,99 @@ They are carried out in this order, from the material outwards:
 4. ``wobble``: the stage turns about another axis than during the reference scan. Fixed in the lab, this is a
    sine and a cosine of the stage angle in the sample frame.
 
+One more is one more record here, a `Deforming` or a `Moving` one, and its field in `MotionOptions`.
+
 The default amplitudes give the paper's initial SNR, before any correction: 9.9 dB expected as the mean over steps
 (10.1 dB for an ideal reference), against the 9.94 dB reported. Its mean translations are drawn, but not told in
 numbers.
-
-`into_sections` replaces the whole by its like in the solver's space: 15 sections fixed in space, each with six
-rigid motions, each the sum of the paper's seven time functions (Table 1).
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from pdvc.settings import Settings
-from simulator.kinematics import BeamMotion, Composition, Motion, RigidMotion, SectionMotion
+from simulator.kinematics import BeamMotion, Composition, Motion, RigidMotion
 from simulator.loading import LoadHistory
 
 Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
-Ingredient = Literal["tension", "bending", "torsion", "compliance", "backlash", "wobble"]
 Poisson = Annotated[float, Field(ge=0, le=0.5)]
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 
 
-class Tension(Settings):
-    """Stretch by the strains of the loading law."""
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """What happens during the test, for the ingredients to follow."""
+
+    history: LoadHistory
+    """Force and strains at each step."""
+    area_mm2: Floats
+    """Area of the section at the heights of the history (height,), mm2."""
+    angle_rad: Floats
+    """Stage angle (step,), rad."""
+    start_step: int
+    """Step at which the stroke starts."""
+    view_mm: float
+    """The field of view reaches from -view_mm to +view_mm, mm."""
+
+    def moment_share(self) -> Floats:
+        """Return the part (height,) of a turn between the ends of the field of view that each section has made.
+
+        A section gives way to a moment like 1 / area^2: exact for a section that keeps its shape.
+        """
+        height = self.history.height_mm
+        share = _from_origin(height, 1 / self.area_mm2**2)
+        share /= np.interp(self.view_mm, height, share) - np.interp(-self.view_mm, height, share)
+        return share
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deformation:
+    """The deformation of a beam, section by section; several add up, and what one leaves out is left as it is."""
+
+    strain: Floats = field(default_factory=lambda: np.zeros(()))
+    """Axial strain (step, height), without unit."""
+    stretch: Floats = field(default_factory=lambda: np.ones(()))
+    """Transverse stretch (step, height), without unit."""
+    bend_rad: Floats = field(default_factory=lambda: np.zeros(()))
+    """Rotation vector of the section by bending (step, height, 3), rad."""
+    twist_rad: Floats = field(default_factory=lambda: np.zeros(()))
+    """Rotation vector of the section by torsion (step, height, 3), before it is bent, rad."""
+
+
+class Ingredient(Settings):
+    """Something that makes the sample move."""
+
+
+class Deforming(Ingredient):
+    """An ingredient that deforms the sample between its grips."""
+
+    @abstractmethod
+    def deformation(self, drive: Drive) -> Deformation:
+        """Return what it does to the sections of the sample."""
+
+
+class Moving(Ingredient):
+    """An ingredient that moves the sample as it has been deformed."""
+
+    @abstractmethod
+    def motion(self, drive: Drive) -> Motion:
+        """Return the motion."""
+
+
+class Tension(Deforming):
+    """A stretch by the strains of the loading law."""
 
     contraction: bool = True
     """whether sections shrink as they stretch"""
@@ -49,34 +110,59 @@ class Tension(Settings):
     poisson_plastic: Poisson = 0.5
     """transverse over axial plastic strain; 0.5 keeps the volume"""
 
+    def deformation(self, drive: Drive) -> Deformation:
+        """Return the strain of the loading, and the contraction that goes with it."""
+        strain, plastic = drive.history.strain, drive.history.plastic
+        elastic_ratio, plastic_ratio = np.array([self.poisson_elastic, self.poisson_plastic]) * self.contraction
+        return Deformation(strain=strain, stretch=1 - elastic_ratio * (strain - plastic) - plastic_ratio * plastic)
 
-class Bending(Settings):
-    """Bend in proportion to the force gained, more where the section is small."""
+
+class Bending(Deforming):
+    """A bend in proportion to the force gained, more where the section is small."""
 
     angle_deg: float = 0.2
     """angle between the ends of the field of view at the last step, degrees"""
     direction_deg: float = 30.0
     """horizontal direction towards which the top leans, from x towards y, degrees"""
 
+    def deformation(self, drive: Drive) -> Deformation:
+        """Return rotations about the horizontal that the top leans over."""
+        lean = np.deg2rad(self.direction_deg)
+        about = np.array([-np.sin(lean), np.cos(lean), 0.0])
+        bend = np.deg2rad(self.angle_deg) * drive.moment_share()[:, None] * about
+        return Deformation(bend_rad=drive.history.load_fraction[:, None, None] * bend)
 
-class Torsion(Settings):
-    """Twist about z in proportion to the force gained, more where the section is small."""
+
+class Torsion(Deforming):
+    """A twist about z in proportion to the force gained, more where the section is small."""
 
     angle_deg: float = 0.15
     """twist between the ends of the field of view at the last step, degrees"""
 
+    def deformation(self, drive: Drive) -> Deformation:
+        """Return rotations about z."""
+        twist = np.deg2rad(self.angle_deg) * drive.moment_share()[:, None] * np.array([0.0, 0.0, 1.0])
+        return Deformation(twist_rad=drive.history.load_fraction[:, None, None] * twist)
 
-class Compliance(Settings):
-    """Give way to the force: the machine between the sample and the stage."""
+
+class Compliance(Moving):
+    """The machine between the sample and the stage, which gives way to the force."""
 
     shift_mm: Vector = (0.14, 0.02, -0.18)
     """shift (x, y, z) reached at the last step, in proportion to the force gained, mm"""
     tilt_deg: Vector = (0.03, 0.08, 0.02)
     """rotation vector (x, y, z) reached at the last step, about the origin, degrees"""
 
+    def motion(self, drive: Drive) -> RigidMotion:
+        """Return the shift and tilt that follow the force."""
+        load = drive.history.load_fraction[:, None]
+        return RigidMotion(
+            rotation_rad=load * np.deg2rad(self.tilt_deg), translation_mm=load * np.array(self.shift_mm)
+        )
 
-class Backlash(Settings):
-    """Move between the reference scan and the test, and when the stroke starts."""
+
+class Backlash(Moving):
+    """A jump between the reference scan and the test, and a short motion when the stroke starts."""
 
     before_mm: Vector = (0.18, 0.03, 0.03)
     """shift between the reference scan and the test, mm"""
@@ -89,9 +175,18 @@ class Backlash(Settings):
     start_steps: Annotated[int, Field(ge=1)] = 3
     """steps that the motion at the start of the stroke takes"""
 
+    def motion(self, drive: Drive) -> RigidMotion:
+        """Return the jump before the test and the short motion at the start of the stroke."""
+        steps = np.arange(len(drive.angle_rad))
+        ramp = np.clip((steps - drive.start_step) / self.start_steps, 0.0, 1.0)[:, None]
+        return RigidMotion(
+            rotation_rad=np.deg2rad(self.before_deg) + ramp * np.deg2rad(self.start_deg),
+            translation_mm=np.array(self.before_mm) + ramp * np.array(self.start_mm),
+        )
 
-class Wobble(Settings):
-    """Turn about another axis than during the reference scan; fixed in the lab."""
+
+class Wobble(Moving):
+    """Another axis of rotation than during the reference scan; fixed in the lab."""
 
     across_mm: float = 0.05
     """shift of the axis across the beam, to the right of the image, mm"""
@@ -102,11 +197,27 @@ class Wobble(Settings):
     lean_deg: float = 0.01
     """turn of the axis about the horizontal across the beam, degrees"""
 
+    def motion(self, drive: Drive) -> RigidMotion:
+        """Return the motion of an axis displaced in the lab: along e_c and e_b of `pdvc.geometry`."""
+        c, s, zero = np.cos(drive.angle_rad), np.sin(drive.angle_rad), np.zeros_like(drive.angle_rad)
+        beam, column = np.column_stack([c, -s, zero]), np.column_stack([-s, -c, zero])
+        return RigidMotion(
+            rotation_rad=np.deg2rad(self.roll_deg) * beam + np.deg2rad(self.lean_deg) * column,
+            translation_mm=self.across_mm * column + self.along_mm * beam,
+        )
+
+
+def _known(name: str) -> str:
+    names = [repr(each) for each in MotionOptions.names()]
+    if repr(name) not in names:
+        raise ValueError(f"{', '.join(names[:-1])} or {names[-1]}")
+    return name
+
 
 class MotionOptions(Settings):
     """Motion of the sample during the test; the reference scan is made at rest."""
 
-    ingredients: tuple[Ingredient, ...] = (
+    ingredients: tuple[Annotated[str, AfterValidator(_known)], ...] = (
         "tension",
         "bending",
         "torsion",
@@ -137,116 +248,36 @@ class MotionOptions(Settings):
             raise ValueError("0, or at least 2 sections")
         return value
 
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the names of all ingredients there are, in the order in which they are carried out."""
+        return tuple(name for name, each in cls.model_fields.items() if isinstance(each.default, Ingredient))
 
-def build_motion(
-    options: MotionOptions,
-    history: LoadHistory,
-    area_mm2: Floats,
-    angle_rad: Floats,
-    start_step: int,
-    view_mm: float,
-) -> Composition:
-    """Build the motion of a scenario.
-
-    `area_mm2` (height,) goes with the heights of the history, `angle_rad` (step,) is the stage angle, the
-    stroke starts at `start_step`, and the field of view reaches from -view_mm to +view_mm.
-    """
-    active = set(options.ingredients)
-    parts: list[Motion] = []
-    if active & {"tension", "bending", "torsion"}:
-        parts.append(beam_motion(options, history, area_mm2, view_mm))
-    if "compliance" in active:
-        parts.append(compliance_motion(options.compliance, history))
-    if "backlash" in active:
-        parts.append(backlash_motion(options.backlash, len(angle_rad), start_step))
-    if "wobble" in active:
-        parts.append(wobble_motion(options.wobble, angle_rad))
-    return Composition(tuple(parts))
+    def motion(self, drive: Drive) -> Composition:
+        """Return what the ingredients that take place do together: deformation first, then the motions."""
+        active: list[Ingredient] = [getattr(self, name) for name in self.names() if name in self.ingredients]
+        deformations = [each.deformation(drive) for each in active if isinstance(each, Deforming)]
+        beam = [beam_motion(deformations, drive)] if deformations else []
+        return Composition((*beam, *(each.motion(drive) for each in active if isinstance(each, Moving))))
 
 
-def beam_motion(options: MotionOptions, history: LoadHistory, area_mm2: Floats, view_mm: float) -> BeamMotion:
-    """Build tension, bending and torsion, those that are active, into one motion of beam sections."""
-    active = set(options.ingredients)
-    tension = options.tension
-    height, load = history.height_mm, history.load_fraction
-    strain = history.strain * ("tension" in active)
-    plastic = history.plastic * ("tension" in active)
-    nu = np.array([tension.poisson_elastic, tension.poisson_plastic]) * tension.contraction
-    # a section gives way to a moment like 1 / area^2: exact for a section that keeps its shape
-    share = _from_origin(height, 1 / area_mm2**2)
-    share /= np.interp(view_mm, height, share) - np.interp(-view_mm, height, share)
-    lean = np.deg2rad(options.bending.direction_deg)
-    about = np.array([-np.sin(lean), np.cos(lean), 0.0])
-    bend = np.deg2rad(options.bending.angle_deg) * ("bending" in active) * share[:, None] * about
-    twist = np.deg2rad(options.torsion.angle_deg) * ("torsion" in active) * share[:, None] * [0.0, 0.0, 1.0]
-    turns = [Rotation.from_rotvec(part * bend) * Rotation.from_rotvec(part * twist) for part in load]
+def beam_motion(parts: Sequence[Deformation], drive: Drive) -> BeamMotion:
+    """Return the motion of a beam that several ingredients deform."""
+    height, steps = drive.history.height_mm, len(drive.angle_rad)
+    strain, stretch = np.zeros((steps, len(height))), np.ones((steps, len(height)))
+    bend, twist = np.zeros((2, steps, len(height), 3))
+    for part in parts:
+        strain, stretch = strain + part.strain, stretch * part.stretch
+        bend, twist = bend + part.bend_rad, twist + part.twist_rad
+    turns = [Rotation.from_rotvec(bend[t]) * Rotation.from_rotvec(twist[t]) for t in range(steps)]
     upward = np.stack([turn.apply([0.0, 0.0, 1.0]) for turn in turns])
     centre = _from_origin(height, (1 + strain)[..., None] * upward)
     return BeamMotion(
         knot_mm=height,
         displacement_mm=centre - height[:, None] * np.array([0.0, 0.0, 1.0]),
         rotation_rad=np.stack([turn.as_rotvec() for turn in turns]),
-        stretch=1 - nu[0] * (strain - plastic) - nu[1] * plastic,
+        stretch=stretch,
     )
-
-
-def compliance_motion(options: Compliance, history: LoadHistory) -> RigidMotion:
-    """Build the shift and tilt that follow the force."""
-    load = history.load_fraction[:, None]
-    return RigidMotion(
-        rotation_rad=load * np.deg2rad(options.tilt_deg), translation_mm=load * np.array(options.shift_mm)
-    )
-
-
-def backlash_motion(options: Backlash, steps: int, start_step: int) -> RigidMotion:
-    """Build the jump before the test and the short motion at the start of the stroke."""
-    ramp = np.clip((np.arange(steps) - start_step) / options.start_steps, 0.0, 1.0)[:, None]
-    return RigidMotion(
-        rotation_rad=np.deg2rad(options.before_deg) + ramp * np.deg2rad(options.start_deg),
-        translation_mm=np.array(options.before_mm) + ramp * np.array(options.start_mm),
-    )
-
-
-def wobble_motion(options: Wobble, angle_rad: Floats) -> RigidMotion:
-    """Build the motion of an axis displaced in the lab: along e_c and e_b of `pdvc.geometry`."""
-    c, s, zero = np.cos(angle_rad), np.sin(angle_rad), np.zeros_like(angle_rad)
-    beam, column = np.column_stack([c, -s, zero]), np.column_stack([-s, -c, zero])
-    return RigidMotion(
-        rotation_rad=np.deg2rad(options.roll_deg) * beam + np.deg2rad(options.lean_deg) * column,
-        translation_mm=options.across_mm * column + options.along_mm * beam,
-    )
-
-
-def time_functions(force_N: Floats, angle_rad: Floats, start_step: int) -> Floats:
-    """Return the seven time functions of the paper's Table 1, (step, 7), each scaled to about one."""
-    t = np.arange(len(force_N)) / max(len(force_N) - 1, 1)
-    ramp = np.maximum(t - start_step / max(len(force_N) - 1, 1), 0.0)
-    columns = [force_N / force_N.max(), np.sin(angle_rad), np.cos(angle_rad), np.ones_like(t), t, ramp, ramp**2]
-    return np.column_stack(columns)
-
-
-def into_sections(motion: Motion, height_mm: Floats, time: Floats) -> SectionMotion:
-    """Return the motion of sections fixed at `height_mm` that is nearest to another one.
-
-    Each section takes the displacement and the mean rotation found at its centre (0, 0, z_j) of the current
-    configuration, and each of its six histories the nearest sum of the `time` functions (step, function).
-    """
-    arm = 1e-3
-    steps = len(time)
-    centres = height_mm[:, None] * np.array([0.0, 0.0, 1.0])
-    offsets = arm * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    probes = (centres[:, None] + offsets).reshape(-1, 3)
-    histories = np.empty((steps, len(height_mm), 6))
-    for step in range(steps):
-        u = (probes - motion.inverse(probes, step)).reshape(len(height_mm), 5, 3)
-        by_x, by_y = (u[:, 1] - u[:, 2]) / (2 * arm), (u[:, 3] - u[:, 4]) / (2 * arm)
-        histories[step, :, :3] = u[:, 0]
-        histories[step, :, 3] = by_y[:, 2]
-        histories[step, :, 4] = -by_x[:, 2]
-        histories[step, :, 5] = (by_x[:, 1] - by_y[:, 0]) / 2
-    flat = histories.reshape(steps, -1)
-    fitted = (time @ np.linalg.lstsq(time, flat, rcond=None)[0]).reshape(histories.shape)
-    return SectionMotion(height_mm=height_mm, translation_mm=fitted[..., :3], rotation_rad=fitted[..., 3:])
 
 
 def _from_origin(height_mm: Floats, slope: Floats) -> Floats:

@@ -30,7 +30,7 @@ TOLERANCE_MM = 1e-11
 
 
 class Motion(Protocol):
-    """Carry material points to where they are at a step, and back."""
+    """A motion of material points: to where they are at a step, and back."""
 
     def forward(self, points_mm: Floats, step: int) -> Floats:
         """Return the positions x of material points X, (point, 3) in mm."""
@@ -43,12 +43,12 @@ class Motion(Protocol):
 
 
 class MotionError(ValueError):
-    """Say which prescribed motion cannot be carried out, and why."""
+    """A prescribed motion that cannot be carried out: which, and why."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RigidMotion:
-    """Turn and shift the whole sample: x = centre + R(r) (X - centre) + t."""
+    """A turn and a shift of the whole sample: x = centre + R(r) (X - centre) + t."""
 
     rotation_rad: Floats
     """Rotation vector r (step, 3), rad."""
@@ -61,13 +61,13 @@ class RigidMotion:
         """Return the positions x of material points X."""
         matrix = rotation_matrix(self.rotation_rad[step])
         arm = points_mm - self.centre_mm
-        return np.einsum("ab,pb->pa", matrix, arm) + (self.translation_mm[step] + self.centre_mm)
+        return np.asarray(np.einsum("ab,pb->pa", matrix, arm) + (self.translation_mm[step] + self.centre_mm))
 
     def inverse(self, points_mm: Floats, step: int) -> Floats:
         """Return the material points X found at positions x."""
         matrix = rotation_matrix(self.rotation_rad[step])
         arm = points_mm - (self.translation_mm[step] + self.centre_mm)
-        return np.einsum("ba,pb->pa", matrix, arm) + self.centre_mm
+        return np.asarray(np.einsum("ba,pb->pa", matrix, arm) + self.centre_mm)
 
     def gradient(self, points_mm: Floats, step: int) -> Floats:
         """Return R for every point."""
@@ -76,7 +76,7 @@ class RigidMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class BeamMotion:
-    """Move a slender sample section by section: x = Z e_z + d(Z) + R(Z) s(Z) [X, Y, 0].
+    """The motion of a slender sample, section by section: x = Z e_z + d(Z) + R(Z) s(Z) [X, Y, 0].
 
     Profiles are given at knots and joined by natural cubic splines, so that the deformation gradient is
     smooth; beyond the outermost knots they go on linearly.
@@ -94,7 +94,7 @@ class BeamMotion:
     def forward(self, points_mm: Floats, step: int) -> Floats:
         """Return the positions x of material points X."""
         section = self._sections(points_mm[:, 2], step)
-        return section.centre + np.einsum("pab,pb->pa", section.matrix, section.flat(points_mm))
+        return np.asarray(section.centre + np.einsum("pab,pb->pa", section.matrix, section.flat(points_mm)))
 
     def inverse(self, points_mm: Floats, step: int) -> Floats:
         """Return the material points X found at positions x.
@@ -148,7 +148,7 @@ class BeamMotion:
 
 @dataclass(frozen=True)
 class _Sections:
-    """Hold the state of one section for each point, and its derivatives along Z."""
+    """The state of one section for each point, and its derivatives along Z."""
 
     shift: Floats
     centre: Floats
@@ -165,7 +165,7 @@ class _Sections:
 
 @dataclass(frozen=True, kw_only=True)
 class SectionMotion:
-    """Move by sections fixed in space: X = x - u(x), u(x) = sum_j p_j(z) [t_j + w_j x (x - z_j e_z)].
+    """A motion by sections fixed in space: X = x - u(x), u(x) = sum_j p_j(z) [t_j + w_j x (x - z_j e_z)].
 
     p_j are the hat functions of Eq. 18, constant beyond the outermost sections; x is the *current*
     position. The inverse is closed; the forward map solves x - u(x) = X by Newton's method.
@@ -219,7 +219,7 @@ class SectionMotion:
     def _of_section(self, x: Floats, section: NDArray[np.intp], step: int) -> Floats:
         arm = x.copy()
         arm[:, 2] -= self.height_mm[section]
-        return self.translation_mm[step, section] + np.cross(self.rotation_rad[step, section], arm)
+        return np.asarray(self.translation_mm[step, section] + np.cross(self.rotation_rad[step, section], arm))
 
     def _hats(self, z: Floats) -> tuple[NDArray[np.intp], Floats, Floats]:
         """Return the section below, the weight of the one above, and that weight's slope along z."""
@@ -233,7 +233,7 @@ class SectionMotion:
 
 @dataclass(frozen=True)
 class Composition:
-    """Carry out several motions, the first one first; none at all is rest."""
+    """Several motions carried out one after the other, the first one first; none at all is rest."""
 
     motions: tuple[Motion, ...] = ()
 
@@ -275,7 +275,7 @@ def _spin(vector: Floats, slope: Floats) -> Floats:
     _, second, third = _exponential_factors(vector)
     cross = cross_matrix(vector)
     jacobian = np.eye(3) + second * cross + third * (cross @ cross)
-    return np.einsum("...ab,...b->...a", jacobian, slope)
+    return np.asarray(np.einsum("...ab,...b->...a", jacobian, slope))
 
 
 def _exponential_factors(vector: ArrayLike) -> tuple[Floats, Floats, Floats]:

@@ -66,7 +66,7 @@ class Loading(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class LoadHistory:
-    """Hold what the loading does to the sample at each step, relative to the plateau force."""
+    """What the loading does to the sample at each step, relative to the plateau force."""
 
     time_s: Floats
     """Time of each step (step,), s."""

@@ -55,7 +55,7 @@ class Graphite(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Nodules:
-    """Hold spheres in the sample frame, ordered from the bottom up."""
+    """The nodules as spheres in the sample frame, ordered from the bottom up."""
 
     centre_mm: NDArray[np.float64]
     """Centres (n, 3), mm."""

@@ -34,7 +34,7 @@ from pdvc.geometry import ConeBeam
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Hold the deformed object in the sample frame, as the stage sees it at angle 0."""
+    """The deformed object in the sample frame, as the stage sees it at angle 0."""
 
     vertices_mm: NDArray[np.float64]
     """Vertices (v, 3) of the closed surface of the matrix, mm."""
@@ -77,6 +77,7 @@ def path_lengths(
     for points in (vertices, centres):
         points[:, 0] += geometry.source_axis_mm
         _check_depth(points[:, 0], geometry, angle_rad)
+    # depths of some 30 mm that cancel to a length of 1 mm: in double precision
     surface = np.zeros((fine.rows, fine.columns))
     _add_surface(
         surface, *fine.image_of(vertices), 1 / vertices[:, 0], np.ascontiguousarray(body.faces, dtype=np.int64)
@@ -98,7 +99,7 @@ def _check_depth(depth_mm: NDArray[np.float64], geometry: ConeBeam, angle_rad: f
 
 @dataclass(frozen=True)
 class _Screen:
-    """Be the sub-pixel grid: number q of a centre <-> place (a, b) on the detector <-> ray."""
+    """The sub-pixel grid: number q of a centre <-> place (a, b) on the detector <-> ray."""
 
     rows: int
     columns: int
@@ -160,6 +161,7 @@ def _add_surface(total, column, row, nearness, faces):  # type: ignore[no-untype
     for f in range(len(faces)):
         top = min(row[faces[f, 0]], row[faces[f, 1]], row[faces[f, 2]])
         bottom = max(row[faces[f, 0]], row[faces[f, 1]], row[faces[f, 2]])
+        # centres are at whole numbers: the rows with top <= i < bottom
         first, last = max(math.ceil(top), 0), min(math.ceil(bottom), rows)
         if first >= last:
             continue
@@ -174,6 +176,7 @@ def _add_surface(total, column, row, nearness, faces):  # type: ignore[no-untype
             gc, gr = (w1 * r2 - w2 * r1) / area, (c1 * w2 - c2 * w1) / area
         low, high = min(w, w + w1, w + w2), max(w, w + w1, w + w2)
         for i in range(first, last):
+            # the two columns at which this row crosses the triangle: at[0] on an edge that goes down, at[1] up
             for k in range(3):
                 p, q = faces[f, k], faces[f, (k + 1) % 3]
                 above_p, above_q = row[p] <= i, row[q] <= i
@@ -185,6 +188,7 @@ def _add_surface(total, column, row, nearness, faces):  # type: ignore[no-untype
             sign = 1.0 if at[0] > at[1] else -1.0
             start, stop = max(math.ceil(min(at[0], at[1])), 0), min(math.ceil(max(at[0], at[1])), columns)
             base = w + gr * (i - r0) - gc * c0
+            # limited, as a triangle seen edge on has hardly an area to divide by
             for j in range(start, stop):
                 total[i, j] += sign / min(max(base + gc * j, low), high)
 
@@ -217,11 +221,13 @@ def _add_nodules(total, centres, shapes, column, row, d0, by_column, by_row):  #
     rows, columns = total.shape
     dx, dy = (by_column[0], by_column[1], by_column[2]), (by_row[0], by_row[1], by_row[2])
     for n in range(len(centres)):
+        # columns and rows count from here: they stay small, and the quadratics keep their digits
         jc, ic = round(column[n]), round(row[n])
         c = (centres[n, 0], centres[n, 1], centres[n, 2])
         a1 = (shapes[n, 0, 0], shapes[n, 0, 1], shapes[n, 0, 2])
         a2 = (shapes[n, 1, 0], shapes[n, 1, 1], shapes[n, 1, 2])
         a3 = (shapes[n, 2, 0], shapes[n, 2, 1], shapes[n, 2, 2])
+        # adj(A) by rows: the cross products of the columns of A
         r1, r2, r3 = _cross(a2, a3), _cross(a3, a1), _cross(a1, a2)
         d = (
             d0[0] + jc * dx[0] + ic * dy[0],
@@ -251,6 +257,7 @@ def _add_nodules(total, centres, shapes, column, row, d0, by_column, by_row):  #
         last = min(math.floor(-m1 / m2 + half), rows - 1 - ic)
         twice_det = 2 * abs(_dot(a1, r1))
         for y in range(first, last + 1):
+            # in this row: |e|^2 - |g|^2 = s0 + 2 sx x + kxx x^2, and |e|^2 = t0 + tx x + txx x^2
             s0, sx = k0 + y * (ky + y * kyy), (kx + y * kxy) / 2
             e = (e0[0] + y * ey[0], e0[1] + y * ey[1], e0[2] + y * ey[2])
             t0, tx, txx = _dot(e, e), 2 * _dot(e, ex), _dot(ex, ex)
@@ -258,6 +265,7 @@ def _add_nodules(total, centres, shapes, column, row, d0, by_column, by_row):  #
             start = max(math.ceil(-sx / kxx - wide), -jc)
             stop = min(math.floor(-sx / kxx + wide), columns - 1 - jc)
             for x in range(start, stop + 1):
+                # rounding at the rim may leave less than nothing
                 square = max(s0 + x * (2 * sx + x * kxx), 0.0)
                 total[ic + y, jc + x] += twice_det * math.sqrt(square) / (t0 + x * (tx + x * txx))
 

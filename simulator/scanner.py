@@ -37,27 +37,18 @@ from pdvc.lock import FULL_DISK, held
 from pdvc.progress import Progress, silent
 from simulator.clean import clean_stack
 from simulator.detector import DetectorMaps, expose_dark, expose_flat
+from simulator.images import Clear, maps_of, prepare
 from simulator.scenario import Course, Scenario, course_of
 from simulator.side_by_side import in_order
+from simulator.stacks import Image, Stack, clear_images, exposed, image_count, stacks_of
+from simulator.streams import stream
 from simulator.truth import DISPLACEMENT, SCENARIO, read_scenario, sample_truth, write_scenario, write_truth
-from simulator.views import (
-    Clear,
-    Image,
-    Stack,
-    clear_images,
-    exposed,
-    image_count,
-    maps_of,
-    prepare,
-    stacks_of,
-    stream,
-)
 
 Floats = NDArray[np.float64]
 
 
 class SimulationError(ValueError):
-    """Say why a scenario cannot be carried out in a folder, and what to do."""
+    """A scenario that cannot be carried out in a folder: why, and what to do."""
 
 
 def simulate(

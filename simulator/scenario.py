@@ -1,4 +1,4 @@
-"""Describe an experiment completely: one frozen record, read from TOML, with built-in examples.
+"""A complete description of an experiment: one frozen record, read from TOML, with built-in examples.
 
 A scenario and the version of this software determine every count of the simulated folder.
 """
@@ -20,10 +20,11 @@ from pdvc.experiment import GeometryEntry, check_held_steps
 from pdvc.geometry import ConeBeam
 from pdvc.settings import Settings, SettingsError
 from simulator.detector import Detector
-from simulator.ingredients import MotionOptions, build_motion, into_sections, time_functions
+from simulator.ingredients import Drive, MotionOptions
 from simulator.kinematics import Motion
 from simulator.loading import LoadHistory, Loading, load_history
 from simulator.microstructure import Graphite
+from simulator.solver_space import into_sections, time_functions
 from simulator.specimen import Specimen, area_mm2, section_mm
 from simulator.xray import XraySource
 
@@ -182,7 +183,7 @@ class Scenario(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """Hold the course of an experiment: angles, times, loading and motion."""
+    """The course of an experiment: angles, times, loading and motion."""
 
     reference_angle_rad: Floats
     reference_time_s: Floats
@@ -208,10 +209,12 @@ def course_of(scenario: Scenario) -> Course:
     height = np.linspace(-half, half, 2 * math.ceil(half / HEIGHT_STEP_MM) + 1)
     area = area_mm2(specimen, height)
     history = load_history(scenario.loading, plan.step_s * steps, height, area)
-    stroke_step = scenario.loading.plateau_steps
-    motion: Motion = build_motion(scenario.motion, history, area, angle, stroke_step, scenario.view_mm)
+    stroke_step, view = scenario.loading.plateau_steps, scenario.view_mm
+    motion: Motion = scenario.motion.motion(
+        Drive(history=history, area_mm2=area, angle_rad=angle, start_step=stroke_step, view_mm=view)
+    )
     if scenario.motion.sections:
-        levels = np.linspace(-scenario.view_mm, scenario.view_mm, scenario.motion.sections)
+        levels = np.linspace(-view, view, scenario.motion.sections)
         motion = into_sections(motion, levels, time_functions(history.force_N, angle, stroke_step))
     held = scenario.interrupted
     held_views = np.arange(held.views or plan.reference_views, dtype=float)

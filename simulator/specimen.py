@@ -99,13 +99,13 @@ def area_mm2(specimen: Specimen, z_mm: ArrayLike) -> NDArray[np.float64]:
 def turn(specimen: Specimen, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Carry points (..., 3) from specimen axes to the sample frame: a turn by `turned_deg` about z, mm."""
     c, s = np.cos(np.deg2rad(specimen.turned_deg)), np.sin(np.deg2rad(specimen.turned_deg))
-    return points_mm @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(points_mm @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
 def turn_back(specimen: Specimen, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Carry points (..., 3) from the sample frame to specimen axes, mm: the inverse of `turn`."""
     c, s = np.cos(np.deg2rad(specimen.turned_deg)), np.sin(np.deg2rad(specimen.turned_deg))
-    return points_mm @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(points_mm @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
 def depth_mm(specimen: Specimen, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:

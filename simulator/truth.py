@@ -30,7 +30,7 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """Hold the true motion of a grid of material points, in the frame of `pdvc.geometry`."""
+    """The true motion of a grid of material points, in the frame of `pdvc.geometry`."""
 
     level_mm: Floats
     """Heights of the levels in the reference configuration (level,), mm, increasing."""

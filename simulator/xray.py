@@ -52,7 +52,7 @@ class XraySource(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Spectrum:
-    """Hold the fluence of a tube behind its filters, in bins of energy."""
+    """The fluence of a tube behind its filters, in bins of energy."""
 
     energy_keV: NDArray[np.float64]
     """Bin centres (e,), keV."""
@@ -123,7 +123,7 @@ def write_spectrum(path: Path, spectrum: Spectrum, comment: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Beam:
-    """Hold what the detector sees of each energy, and what the materials take from it."""
+    """What the detector sees of each energy, and what the materials take from it."""
 
     energy_keV: NDArray[np.float64]
     """Bin centres (e,), keV."""
@@ -162,7 +162,7 @@ def direct_transmission(
 
 @dataclass(frozen=True, kw_only=True)
 class TransmissionTable:
-    """Hold -log T on a grid of matrix and graphite lengths that starts at 0, and interpolate it bilinearly.
+    """-log T on a grid of matrix and graphite lengths that starts at 0, between which it is bilinear.
 
     The second derivative of -log T along a length is minus the variance of mu over the transmitted spectrum,
     so that the relative error of T is at most step^2 / 8 times the largest variance.
@@ -209,7 +209,7 @@ class TransmissionTable:
             if not (low > -1e-4 and high <= longest):
                 raise ValueError(f"{name} length: expected 0 to {longest:.6g} mm, got {low:.6g} to {high:.6g} mm")
         per_mm = 1 / self.step_mm[0], 1 / self.step_mm[1]
-        return _interpolate(self.log_attenuation, *per_mm, matrix_mm, graphite_mm)
+        return np.asarray(_interpolate(self.log_attenuation, *per_mm, matrix_mm, graphite_mm))
 
 
 @numba.njit(cache=True, nogil=True)

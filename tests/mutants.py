@@ -29,6 +29,7 @@ ROOT = Path(__file__).parent.parent
 
 TESTS = {
     "projection": ("operators", "projection", "solvers"),
+    "walk": ("operators", "projection", "solvers"),
     "pgd": ("solvers", "projected_laws", "measure"),
     "gauss_newton": ("solvers", "blocks", "projected_laws"),
     "uncertainty": ("uncertainty", "noise"),

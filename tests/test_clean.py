@@ -15,9 +15,10 @@ import tifffile
 from pdvc.experiment import DARKS, FLATS, REFERENCE, TEST, interrupted_stack, read_experiment
 from pdvc.settings import Settings
 from simulator.clean import clean_file, clean_stack
+from simulator.images import prepare
 from simulator.scanner import simulate
 from simulator.scenario import course_of
-from simulator.views import Stack, clear_images, image_count, prepare
+from simulator.stacks import Stack, clear_images, image_count
 from tests.tiny_scenarios import tinier
 
 ALL = (REFERENCE, TEST, FLATS, DARKS, interrupted_stack(0))

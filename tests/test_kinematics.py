@@ -6,19 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from simulator.ingredients import (
-    Bending,
-    Compliance,
-    MotionOptions,
-    Torsion,
-    Wobble,
-    build_motion,
-    into_sections,
-    time_functions,
-    wobble_motion,
-)
+from simulator.ingredients import Bending, Compliance, Drive, MotionOptions, Moving, Torsion, Wobble
 from simulator.kinematics import BeamMotion, Composition, MotionError, RigidMotion, SectionMotion, rotation_matrix
 from simulator.loading import Loading, load_history
+from simulator.solver_space import into_sections, time_functions
 from simulator.specimen import Specimen, area_mm2
 from tests.laws import law
 from validation.testing.strategies import beam_motions, motions, rigid_motions, section_motions
@@ -28,6 +19,7 @@ ANGLE = 2 * np.pi * np.arange(127) / 50
 HEIGHT = np.linspace(-6.5, 6.5, 261)
 AREA = area_mm2(Specimen(thinned="both"), HEIGHT)
 HISTORY = load_history(Loading(), 2.0 * np.arange(127), HEIGHT, AREA)
+DRIVE = Drive(history=HISTORY, area_mm2=AREA, angle_rad=ANGLE, start_step=50, view_mm=4.03)
 
 
 def material_points(seed: int = 0, count: int = 200):
@@ -35,7 +27,7 @@ def material_points(seed: int = 0, count: int = 200):
 
 
 def paper_motion(**changes):
-    return build_motion(MotionOptions(**changes), HISTORY, AREA, ANGLE, 50, 4.03)
+    return MotionOptions(**changes).motion(DRIVE)
 
 
 @FEW
@@ -193,10 +185,25 @@ def test_backlash_comes_before_the_test_and_with_the_stroke():
 
 def test_wobble_stands_still_in_the_lab():
     # a point of the axis, turned into the lab by the stage, is always shifted by the same vector
-    motion = wobble_motion(Wobble(across_mm=0.05, along_mm=0.02, roll_deg=0.0, lean_deg=0.0), ANGLE)
+    motion = Wobble(across_mm=0.05, along_mm=0.02, roll_deg=0.0, lean_deg=0.0).motion(DRIVE)
     for step in (0, 13, 77):
         lab = Rotation.from_rotvec([0, 0, ANGLE[step]]).apply(motion.forward(np.zeros((1, 3)), step)[0])
         np.testing.assert_allclose(lab, [0.02, -0.05, 0.0], atol=1e-15)  # along +x, and to the right: -y
+
+
+def test_one_more_ingredient_is_a_record_and_a_field():
+    class Drift(Moving):
+        def motion(self, drive):
+            steps = len(drive.angle_rad)
+            return RigidMotion(rotation_rad=np.zeros((steps, 3)), translation_mm=np.ones((steps, 1)) * [0.0, 0.0, 2.0])
+
+    class More(MotionOptions):
+        drift: Drift = Drift()
+
+    assert More.names() == (*MotionOptions.names(), "drift")
+    motion = More().model_copy(update={"ingredients": ("drift", "torsion")}).motion(DRIVE)
+    np.testing.assert_allclose(motion.forward(np.zeros((1, 3)), 126), [[0, 0, 2]], atol=1e-15)
+    assert [type(part) for part in motion.motions] == [BeamMotion, RigidMotion]
 
 
 def test_into_sections_is_exact_for_what_is_in_the_space():

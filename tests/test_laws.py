@@ -22,10 +22,11 @@ from scipy import linalg
 
 from pdvc.history import Angle, Force, Polynomial
 from pdvc.protocol import measure
+from simulator.images import prepare
 from simulator.kinematics import Composition, RigidMotion, rotation_matrix
 from simulator.scenario import course_of
+from simulator.stacks import step_image, view_image
 from simulator.truth import sample_truth
-from simulator.views import prepare, step_image, view_image
 from tests.laws import law
 from tests.synthetic_records import altered
 from validation.scoring.bound import bound_of

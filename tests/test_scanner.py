@@ -8,11 +8,12 @@ from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, interrupted_sta
 from pdvc.settings import SettingsError
 from simulator import scanner
 from simulator.detector import expected
+from simulator.images import prepare, transmission
+from simulator.sample import moved_body
 from simulator.scanner import SimulationError, simulate
 from simulator.scenario import course_of
-from simulator.side_by_side import in_order
+from simulator.stacks import Stack, clear_images, exposed, step_image
 from simulator.truth import DISPLACEMENT, read_scenario, read_truth
-from simulator.views import Stack, clear_images, exposed, moved_body, prepare, step_image, transmission
 from tests.tiny_scenarios import tinier
 
 
@@ -147,65 +148,6 @@ def test_without_motion_the_test_repeats_the_reference(tmp_path):
 def test_with_motion_the_test_differs_by_more_than_noise(folder):
     reference, test, _ = (stack.astype(float) for stack in stacks(folder))
     assert np.abs(reference[0] - test[0]).max() > 2000
-
-
-def test_rigid_motion_by_a_step_of_the_stage_looks_like_the_next_view():
-    # wobble-free turn about z by +10 degrees and stage at 0 = no motion and stage at +10 degrees
-    turned = tinier(
-        motion={
-            "ingredients": ["backlash"],
-            "backlash": {
-                "before_mm": [0, 0, 0],
-                "before_deg": [0, 0, 10],
-                "start_mm": [0, 0, 0],
-                "start_deg": [0] * 3,
-            },
-        }
-    )
-    bench = prepare(turned, course_of(turned))
-    body = moved_body(bench.body, bench.course.motion, 0)
-    one = transmission(bench, body, 0.3, 0.0)
-    two = transmission(bench, bench.body, 0.3 + np.deg2rad(10), 0.0)
-    np.testing.assert_allclose(one, two, atol=2e-6)
-
-
-def test_a_lean_along_the_beam_axis_is_seen_and_a_zero_one_is_not():
-    plain, leaning = tinier(), tinier(misalignment={"lean_deg": 5.0})
-    images = []
-    for scenario in (plain, leaning):
-        bench = prepare(scenario, course_of(scenario))
-        images.append(transmission(bench, bench.body, 0.7, 0.0))
-    # the top comes nearer to the detector or the source: its image shrinks or grows, that of the middle stays
-    assert np.abs(images[0] - images[1])[:8].max() > 10 * np.abs(images[0] - images[1])[38:42].mean()
-
-
-def test_exposure_while_turning_is_the_mean_of_still_exposures():
-    turning = tinier(acquisition={"exposure_samples": 2, "exposure_share": 0.5})
-    bench = prepare(turning, course_of(turning))
-    still = prepare(tinier(), course_of(tinier()))
-    mean = sum(transmission(still, still.body, 0.4 + shift, 0.0) for shift in (-0.0125, 0.0125)) / 2
-    np.testing.assert_allclose(transmission(bench, bench.body, 0.4, 0.1), mean, atol=1e-6)
-
-
-def test_images_are_made_only_a_few_ahead():
-    made = []
-
-    def make(index):
-        made.append(index)
-        return np.full((1, 1), index, dtype=np.uint16)
-
-    for index, image in in_order(make, range(40), 2):
-        assert image[0, 0] == index
-        assert len(made) <= index + 5
-    assert sorted(made) == list(range(40))
-
-
-def test_an_error_in_one_image_surfaces():
-    def fail(index):
-        raise RuntimeError(f"image {index}")
-
-    with pytest.raises(RuntimeError, match="image 0"):
-        list(in_order(fail, range(3), 2))
 
 
 def test_images_can_be_made_one_at_a_time(folder):

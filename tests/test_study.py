@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simulator.scenario import load_scenario
-from simulator.views import stream
+from simulator.streams import stream
 from tests.command_line import only_line, pdvc_bench
 from tests.laws import law
 from validation.batch.engine import is_done

@@ -41,8 +41,8 @@ from pdvc.protocol import measure
 from simulator.clean import clean_file, clean_stack
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
+from simulator.stacks import Stack, stacks_of
 from simulator.truth import Truth, read_truth
-from simulator.views import Stack, stacks_of
 from validation.batch.engine import Part, Result, Scalar
 from validation.scoring.bound import kept_bound
 from validation.scoring.centre_line import centre_line

@@ -29,7 +29,7 @@ from pdvc.progress import Progress, silent
 from pdvc.settings import SettingsError
 from simulator.clean import clean_file
 from simulator.scenario import Scenario
-from simulator.views import stacks_of
+from simulator.stacks import stacks_of
 from validation.batch.engine import Part, Result, Scalar, collected, run_trials
 from validation.batch.machine import machine
 from validation.batch.trial import clean_parts, flattened, score_columns, simulated

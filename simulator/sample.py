@@ -1,0 +1,51 @@
+"""The sample: at rest, as it is moved at a step of the test, and leaning with the rotation axis."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from simulator.kinematics import Motion, rotation_matrix
+from simulator.microstructure import place
+from simulator.radiography import Body
+from simulator.scenario import Scenario
+from simulator.specimen import dog_bone
+from simulator.streams import stream
+
+
+def rest_body(scenario: Scenario) -> Body:
+    """Build the sample in its reference configuration."""
+    surface = dog_bone(scenario.specimen)
+    half = scenario.specimen.length_mm / 2
+    nodules = place(scenario.graphite, scenario.specimen, stream(scenario, "nodules"), half)
+    return Body(
+        vertices_mm=np.asarray(surface.vertices, dtype=np.float64),
+        faces=np.asarray(surface.faces, dtype=np.int64),
+        centres_mm=nodules.centre_mm,
+        shapes_mm=nodules.radius_mm[:, None, None] * np.eye(3),
+    )
+
+
+def moved_body(body: Body, motion: Motion, step: int) -> Body:
+    """Carry the sample along: vertices and centres move, each nodule takes the local affine map."""
+    return Body(
+        vertices_mm=motion.forward(body.vertices_mm, step),
+        faces=body.faces,
+        centres_mm=motion.forward(body.centres_mm, step),
+        shapes_mm=motion.gradient(body.centres_mm, step) @ body.shapes_mm,
+    )
+
+
+def leaning_body(body: Body, lean_rad: float, angle_rad: float) -> Body:
+    """Turn the sample about the horizontal across the beam, e_c of `pdvc.geometry`, at a stage angle."""
+    if lean_rad == 0.0:
+        return body
+    column = np.array([-math.sin(angle_rad), -math.cos(angle_rad), 0.0])
+    matrix = rotation_matrix(lean_rad * column)
+    return Body(
+        vertices_mm=body.vertices_mm @ matrix.T,
+        faces=body.faces,
+        centres_mm=body.centres_mm @ matrix.T,
+        shapes_mm=matrix @ body.shapes_mm,
+    )
