@@ -26,7 +26,7 @@ COARSE = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """Hold a textured volume of a scenario's sample, and the detector windows that look at it."""
+    """A textured volume of a scenario's sample, and the detector windows that look at it."""
 
     scenario: Scenario
     geometry: ConeBeam

@@ -14,7 +14,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Seconds:
-    """Hold what a job takes: by the clock, and in processor time, which other programs disturb less."""
+    """What a job takes: by the clock, and in processor time, which other programs disturb less."""
 
     wall: float
     cpu: float

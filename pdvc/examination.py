@@ -40,7 +40,7 @@ _PIXELS = 15_000
 
 @dataclass(frozen=True, kw_only=True)
 class StackLook:
-    """Hold what the images of a stack look like; transmissions by the mean flat and dark."""
+    """What the images of a stack look like; transmissions by the mean flat and dark."""
 
     lowest: int
     """Smallest count of a pixel that is not bad."""
@@ -66,7 +66,7 @@ class StackLook:
 
 @dataclass(frozen=True, kw_only=True)
 class Examination:
-    """Hold the figures of an experiment."""
+    """The figures of an experiment."""
 
     calibration: Calibration
     stacks: Mapping[str, StackLook]

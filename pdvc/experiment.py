@@ -157,7 +157,7 @@ def check_held_steps(held: tuple[int, ...], steps: int, key: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """Hold a stack of radiographs and what was recorded with each."""
+    """A stack of radiographs and what was recorded with each."""
 
     counts: NDArray[np.uint16]
     """Counts (image, row, column); a memory map where the file allows."""
@@ -171,7 +171,7 @@ class Series:
 
 @dataclass(frozen=True, kw_only=True)
 class InterruptedScan:
-    """Hold a full scan of the sample in the state of one step, while the test was held there."""
+    """A full scan of the sample in the state of one step, while the test was held there."""
 
     step: int
     """Step of the test, counted from 0."""
@@ -180,7 +180,7 @@ class InterruptedScan:
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """Hold everything that a measurement may look at."""
+    """Everything that a measurement may look at."""
 
     title: str
     material: str

@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True, kw_only=True)
 class ConeBeam:
-    """Hold the fixed part of a cone-beam scanner: distances, detector and its place; angles come apart."""
+    """The fixed part of a cone-beam scanner: distances, detector and its place; angles come apart."""
 
     source_axis_mm: float
     """Distance from the source to the rotation axis, mm."""

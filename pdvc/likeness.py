@@ -36,7 +36,7 @@ EVENLY, LEAST_LIKE = 10, 8
 
 @dataclass(frozen=True, kw_only=True)
 class Likeness:
-    """Hold how like radiographs of the test are to reference views."""
+    """How like radiographs of the test are to reference views."""
 
     recorded: Floats
     """(step,) correlation with the reference view at the recorded angle."""

@@ -23,7 +23,7 @@ FULL_DISK = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class InUseError(OSError):
-    """Say which process holds a folder, and what to do."""
+    """Another process holds a folder: which one, and what to do."""
 
 
 @contextmanager

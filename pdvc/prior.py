@@ -16,7 +16,7 @@ LEAST_RMS = 1e-7
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """Hold the standard deviation of every amplitude, all independent and of mean zero.
+    """The standard deviation of every amplitude, all independent and of mean zero.
 
     An amplitude multiplies an orthonormal time function and a section motion, so that it is the rms displacement,
     over the steps, that the motion makes. The solvers minimise chi2 + rms^2 sum (amplitude / deviation)^2,

@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Be told what is being done and how far it is."""
+    """What is told what is being done, and how far it is."""
 
     def __call__(self, task: str, done: int, total: int) -> None:
         """Take note that `done` of `total` parts of `task` are finished."""

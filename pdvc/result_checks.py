@@ -214,7 +214,7 @@ def _of_convergence(found: Measurement) -> Iterator[Doubt]:
         yield Doubt(
             name="not-converged",
             figure=last.stop_reason,
-            advice="allow the last stage more passes: `most`",
+            advice="allow the last stage more passes: `most_passes`, or `most_modes`",
         )
 
 

@@ -41,7 +41,7 @@ _ALIKE_ROWS = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class SeenTwice:
-    """Hold what a scan's agreement with its mirror image tells."""
+    """What a scan's agreement with its mirror image tells."""
 
     factor: float
     """f: fan angle seen over fan angle stated; 1 is due, -1 where the stage turned the other way."""

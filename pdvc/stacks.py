@@ -18,7 +18,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it compl
 
 
 class ExperimentError(ValueError):
-    """Say which file of an experiment folder is wrong, what was expected and what was found."""
+    """A file of an experiment folder is wrong: which, what was expected and what was found."""
 
 
 def read_stack(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:

@@ -33,7 +33,7 @@ UNSEEN = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Posterior:
-    """Hold how well each step's amplitudes are known."""
+    """How well each step's amplitudes are known."""
 
     covariance: Floats
     """C (function * unknown, function * unknown), voxel^2, with unknown = section * motion; or (function, unknown,

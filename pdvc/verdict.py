@@ -20,7 +20,7 @@ STEPS_NAMED = 8
 
 
 class Stop(StrEnum):
-    """Say why a stage ended; `stop_reason` says it in words and numbers."""
+    """Why a stage ended; `stop_reason` says it in words and numbers."""
 
     CONVERGED = "converged"
     """The last change was under its limit."""
@@ -38,7 +38,7 @@ class Stop(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Doubt:
-    """Hold one finding that speaks against a measurement."""
+    """One finding that speaks against a measurement."""
 
     name: str
     """A short name for machines, of small letters and hyphens: docs/verdict.md lists them all."""
@@ -58,7 +58,7 @@ class Doubt:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """Hold the doubts about a measurement; none of them: it is trusted as far as anything here can tell."""
+    """The doubts about a measurement; none of them: it is trusted as far as anything here can tell."""
 
     doubts: tuple[Doubt, ...] = ()
 
@@ -80,7 +80,7 @@ class Verdict:
 
 
 class NotMeasuredError(ValueError):
-    """Say why nothing could be measured, and what spoke against the data before."""
+    """Nothing could be measured: why, and what spoke against the data before."""
 
 
 @contextmanager

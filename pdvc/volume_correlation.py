@@ -53,7 +53,7 @@ from pdvc.solution import Solution
 from pdvc.uncertainty import UNSEEN, sandwich
 from pdvc.verdict import Stop, Verdict
 from pdvc.volume import Volume, halved, smoothed
-from pdvc.volume_equations import Comparison, VolumePair, compare, used_voxels
+from pdvc.volume_equations import VolumeComparison, VolumePair, compare, used_voxels
 
 __all__ = ["MeasureOptions", "correlate"]
 
@@ -269,7 +269,7 @@ def _solved(
     )
 
 
-def _covariance(comparison: Comparison, prior: Prior) -> Floats:
+def _covariance(comparison: VolumeComparison, prior: Prior) -> Floats:
     """Return the covariance (section * motion, the same), voxel^2, of the amplitudes at a comparison."""
     equations = comparison.equations()
     gamma2 = max(equations.rms, LEAST_RMS) ** 2

@@ -63,7 +63,7 @@ class VolumePair:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class VolumeComparison:
     """What a trial motion leaves: the sums over each layer, and the weights that make equations of them."""
 
     weights: Floats
@@ -108,7 +108,7 @@ class Comparison:
         return result
 
 
-def compare(pair: VolumePair, basis: SectionBasis, amplitude: Floats) -> Comparison:
+def compare(pair: VolumePair, basis: SectionBasis, amplitude: Floats) -> VolumeComparison:
     """Compare the moved reference volume with the deformed one, at amplitudes (section, motion), voxels.
 
     Raises ValueError for amplitudes that are not finite or of another shape.
@@ -139,7 +139,7 @@ def compare(pair: VolumePair, basis: SectionBasis, amplitude: Floats) -> Compari
         residual,
     )
     moments += np.tril(moments, -1).transpose(0, 2, 1)
-    return Comparison(
+    return VolumeComparison(
         weights=weights.reshape(shape[0], -1, 9),
         moments=moments,
         blocks=blocks,

@@ -20,7 +20,7 @@ POINT_HEIGHT_MM = np.linspace(-4.4, 4.0, 43)
 
 @dataclass(frozen=True)
 class ClosedFormTruth:
-    """Hold true motion; has what `simulator.truth.Truth` has, as far as scores ask for it."""
+    """True motion; has what `simulator.truth.Truth` has, as far as scores ask for it."""
 
     point_mm: Floats
     displacement_mm: Floats

@@ -28,8 +28,8 @@ FEW = MeasureOptions.parse(
     {
         "sections": 5,
         "time": [{"kind": "force"}, {"kind": "angle"}, {"kind": "polynomial"}],
-        "rigid": [{"scale": 2, "solver": "gauss-newton", "most": 3}],
-        "deformation": [{"solver": "gauss-newton", "most": 3}],
+        "rigid": [{"scale": 2, "solver": {"kind": "gauss-newton", "most_passes": 3}}],
+        "deformation": [{"solver": {"kind": "gauss-newton", "most_passes": 3}}],
     },
     where="few",
 )

@@ -37,8 +37,8 @@ STACKS = ("reference/radiographs.tif", "test/radiographs.tif", "flats.tif", "dar
 FEW = """
 sections = 5
 time = [{ kind = "force" }, { kind = "angle" }, { kind = "polynomial" }]
-rigid = [{ scale = 2, solver = "gauss-newton", most = 2 }]
-deformation = [{ solver = "gauss-newton", most = 2 }]
+rigid = [{ scale = 2, solver = { kind = "gauss-newton", most_passes = 2 } }]
+deformation = [{ solver = { kind = "gauss-newton", most_passes = 2 } }]
 """
 
 

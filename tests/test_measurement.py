@@ -104,13 +104,13 @@ def test_a_truncated_file_is_refused_by_name(measured, tmp_path, share):
     write_measurement(measured, path)
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 3"):
+    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 4"):
         read_measurement(path)
 
 
 def test_another_netcdf_file_is_refused_by_name(tmp_path):
     xr.Dataset({"a": ("x", np.arange(3))}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
-    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 3"):
+    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 4"):
         read_measurement(tmp_path / "a.nc")
 
 
@@ -118,7 +118,7 @@ def test_another_format_is_refused_with_its_number(measured, tmp_path):
     write_measurement(measured, tmp_path / "a.nc")
     with h5py.File(tmp_path / "a.nc", "r+") as file:
         file.attrs["format"] = 99
-    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 3: found format 99"):
+    with pytest.raises(MeasurementError, match=r"a\.nc: expected a measurement of format 4: found format 99"):
         read_measurement(tmp_path / "a.nc")
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -77,7 +75,7 @@ def test_a_test_wholly_at_constant_load_is_found_whole():
 
 def test_a_force_that_nobody_recorded_says_nothing():
     assert constant_load_steps(np.zeros(50)) == 0
-    measurement = replace(records.measurement(still()), force_N=np.zeros(STEPS))
+    measurement = records.altered(records.measurement(still()), force_N=np.zeros(STEPS))
     assert noise_floor(measurement) is None
 
 

@@ -16,7 +16,7 @@ from pdvc.projection import Sensitivities, normal_equations, project, sensitivit
 from pdvc.radiographs import binned, coarsened, smoothed
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import _filtered, _ramp
-from pdvc.sections import CONTRACTION, RIGID, SectionBasis
+from pdvc.sections import CONTRACTION, RIGID, SectionBasis, names_of
 from pdvc.systematic import Systematic
 from tests.laws import law
 from tests.operators import dottest
@@ -47,7 +47,7 @@ STEEP_SHAPE = (STEEP.rows, STEEP.columns)
 CLOSE = SectionBasis(height_mm=np.array([-0.8, -0.3, 0.1, 0.5, 0.9]), radius_mm=0.5, motions=(*RIGID, CONTRACTION))
 """Sections as near to each other as the sample is thick."""
 TURNED = motion(CLOSE, seed=1, size=0.5)
-TURNED[:, RIGID.index("rotation_z")] = [3.0, -3.0, 2.0, -3.0, 3.0]
+TURNED[:, names_of(RIGID).index("rotation_z")] = [3.0, -3.0, 2.0, -3.0, 3.0]
 """Neighbouring sections turned by 0.5 to 0.6 rad against each other."""
 TURNED_AS_ONE = np.tile([1.0, -0.4, 0.6, 0.5, -0.3, 3.0, 0.0], (len(CLOSE.height_mm), 1))
 
@@ -92,7 +92,7 @@ def test_sensitivities_of_a_blob_converge_to_the_integrals_of_its_gradient_at_st
     assert errors[1].mean() < 0.5 * errors[0].mean()
 
 
-@pytest.mark.parametrize("name", [*RIGID, CONTRACTION])
+@pytest.mark.parametrize("name", names_of((*RIGID, CONTRACTION)))
 @pytest.mark.parametrize(
     ("scanner", "angle", "now", "rtol"),
     [
@@ -109,7 +109,7 @@ def test_c_is_the_adjoint_of_the_projection_s_slope(name, scanner, angle, now, r
 
     The slope of a sum over planes is known to some parts in a thousand, as edges pass from plane to plane.
     """
-    rays, k, volume = rays_at(angle, scanner)[None], CLOSE.motions.index(name), textured(3.0)
+    rays, k, volume = rays_at(angle, scanner)[None], CLOSE.names.index(name), textured(3.0)
     shape = (scanner.rows, scanner.columns)
 
     def moved(change: np.ndarray) -> np.ndarray:
@@ -139,7 +139,7 @@ def test_s_and_its_transpose_in_c_and_b_are_one_operator(scanner, angle, seed, t
     heights = np.linspace(-0.45, 0.45, 4) * scanner.rows * scanner.voxel_mm
     basis = SectionBasis(height_mm=heights, radius_mm=radius, motions=(*RIGID, CONTRACTION))
     rays, amplitude = ray_vectors(scanner, angle).stacked(), motion(basis, seed)[None]
-    amplitude[0, :, RIGID.index("rotation_z")] += turned * np.array([1, -1, 1, -1])
+    amplitude[0, :, names_of(RIGID).index("rotation_z")] += turned * np.array([1, -1, 1, -1])
     weight = np.random.default_rng(seed).uniform(0.0, 2.0, (1, *shape)).astype(np.float32)
     unknowns = basis.shape[0] * basis.shape[1]
     s = dense(sensitivities(volume, rays, shape, basis, amplitude, voxel_mm=VOXEL_MM)[0], unknowns)

@@ -14,7 +14,7 @@ from pdvc import projection
 from pdvc.geometry import ConeBeam
 from pdvc.projection import StepEquations
 from pdvc.rays import ray_vectors
-from pdvc.sections import CONTRACTION, RIGID, SectionBasis
+from pdvc.sections import CONTRACTION, RIGID, SectionBasis, names_of
 from pdvc.volume import Grid, Volume
 from tests.laws import law
 from tests.small_case import (
@@ -143,7 +143,7 @@ def test_normal_equations_agree_with_stored_sensitivities(basis, angle):
 def test_rays_at_45_degrees_have_no_seam_between_sections_turned_against_each_other():
     """There a ray follows x and y alike, and its parts in two sections must be summed over the same planes."""
     amplitude = still(SECTIONS)
-    amplitude[:, RIGID.index("rotation_z")] = [0.3, -0.3, 0.3, -0.3]
+    amplitude[:, names_of(RIGID).index("rotation_z")] = [0.3, -0.3, 0.3, -0.3]
     rays = rays_at(np.pi / 4)
     found = project(textured(), rays, SHAPE, SECTIONS, amplitude, voxel_mm=VOXEL_MM)
     expected = plane_sums(textured(), rays, SHAPE, SECTIONS, amplitude, VOXEL_MM)
@@ -211,7 +211,7 @@ def test_the_number_of_sections_does_not_change_the_same_rigid_motion(sections, 
     basis = SectionBasis(height_mm=np.linspace(-1.1, 1.2, sections), radius_mm=0.3)
     amplitude = motion(ONE, seed)
     one = project(textured(), rays_at(angle), SHAPE, ONE, amplitude, voxel_mm=VOXEL_MM)
-    many = project(textured(), rays_at(angle), SHAPE, basis, basis.rigid(amplitude, ONE), voxel_mm=VOXEL_MM)
+    many = project(textured(), rays_at(angle), SHAPE, basis, basis.reproduced(amplitude, ONE), voxel_mm=VOXEL_MM)
     np.testing.assert_allclose(many, one, atol=2e-5 * one.max())
 
 
@@ -288,7 +288,7 @@ def test_steps_together_are_those_one_by_one_to_the_last_bit(one_weight_for_all)
 @pytest.mark.parametrize("kind", ["translation_x", "translation_y", "translation_z"])
 def test_a_sample_moved_out_of_sight_leaves_air(kind):
     amplitude = still(SECTIONS)
-    amplitude[:, RIGID.index(kind)] = 300
+    amplitude[:, names_of(RIGID).index(kind)] = 300
     # along the beam, 15 mm stay on the screen: then look across
     rays = rays_at(np.pi / 2 if kind == "translation_x" else 0.0)
     found = normal_equations(textured(), rays, SECTIONS, amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM)
@@ -357,9 +357,7 @@ def test_a_uniform_bar_cut_in_height_inside_its_hull_feels_no_vertical_motion(an
     x, y, z = endless.grid.origin_mm
     grid = Grid(shape=values.shape, voxel_mm=VOXEL_MM, origin_mm=(x, y, z + 14 * VOXEL_MM))
     cut = Volume(values=values, grid=grid, hull=endless.hull)
-    basis = SectionBasis(
-        height_mm=np.array([0.0]), radius_mm=0.5, motions=("translation_x", "translation_y", "translation_z")
-    )
+    basis = SectionBasis(height_mm=np.array([0.0]), radius_mm=0.5, motions=RIGID[:3])
     found = normal_equations(
         cut, rays_at(angle), basis, np.array([[0.0, 0.0, moved_voxel]]), BLANK, EVEN, voxel_mm=VOXEL_MM
     )

@@ -6,7 +6,9 @@ import inspect
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -83,12 +85,13 @@ def test_the_walk_through_runs(tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def added():
-    """Run the blocks of the how-to page once: kinds are offered for the whole process."""
-    session: dict[str, object] = {"__name__": "added_by_the_page"}
-    for block in blocks("extend.md"):
-        exec(compile(block, "page", "exec", dont_inherit=True), session)
-    return session
+def added(tmp_path_factory):
+    """Import the blocks of the how-to page once, as a module: kinds are offered for the whole process."""
+    folder = tmp_path_factory.mktemp("extend")
+    (folder / "added_by_the_page.py").write_text("\n\n".join(blocks("extend.md")))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        return vars(import_module("added_by_the_page"))
 
 
 def test_a_time_function_is_added_by_the_page_alone(added, tmp_path):
@@ -137,6 +140,14 @@ def test_a_solver_is_added_by_the_page_alone(added, tmp_path):
     measured = pdvc.measure(small.experiment, small.options.model_copy(update={"deformation": options.deformation}))
     assert measured.fit.stages[-1].solver == "one-step"
     assert len(measured.fit.stages[-1].rms) == 2
+
+
+def test_a_scenario_ingredient_of_the_page_does_what_it_says(added):
+    drive = SimpleNamespace(angle_rad=np.zeros(3), history=SimpleNamespace(time_s=np.array([0.0, 10.0, 50.0])))
+    motion = added["Creeping"](speed_mm_s=2e-3).motion(drive)
+    point = np.array([[0.1, -0.2, 1.0]])
+    np.testing.assert_allclose(motion.forward(point, 2), [[0.1, -0.2, 0.9]])
+    np.testing.assert_allclose(motion.inverse(motion.forward(point, 1), 1), point)
 
 
 def test_an_unknown_kind_is_answered_with_the_known_ones():

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pdvc.sections import CONTRACTION, RIGID, SectionBasis
+from pdvc.sections import CONTRACTION, RIGID, SectionBasis, names_of
 from tests.laws import law
 from validation.testing.strategies import section_bases
 
@@ -59,7 +59,7 @@ def test_displacement_follows_the_formula_with_cross_products(basis, data):
 @given(section_bases(), section_bases(), POINTS, arrays(float, (1, 6), elements=NUMBERS))
 def test_sections_reproduce_the_motion_of_a_single_one_everywhere(basis, other, points, amplitude):
     single = SectionBasis(height_mm=other.height_mm[:1], radius_mm=other.radius_mm)
-    same = basis.rigid(amplitude, single)
+    same = basis.reproduced(amplitude, single)
     np.testing.assert_allclose(
         basis.displacement(same, points), single.displacement(amplitude, points), rtol=1e-9, atol=1e-7
     )
@@ -69,23 +69,23 @@ def test_rigid_motions_of_many_steps_are_carried_over_step_by_step():
     single = SectionBasis(height_mm=np.array([0.5]), radius_mm=0.7)
     basis = SectionBasis(height_mm=np.array([-1.0, 0.0, 2.0]), radius_mm=0.4)
     amplitude = np.random.default_rng(1).normal(size=(4, 1, 6))
-    together = basis.rigid(amplitude, single)
+    together = basis.reproduced(amplitude, single)
     assert together.shape == (4, 3, 6)
-    np.testing.assert_array_equal(together[2], basis.rigid(amplitude[2], single))
+    np.testing.assert_array_equal(together[2], basis.reproduced(amplitude[2], single))
 
 
 def test_sections_reproduce_the_contraction_of_a_single_one():
     single = SectionBasis(height_mm=np.array([0.0]), radius_mm=0.5, motions=(CONTRACTION,))
     basis = SectionBasis(height_mm=np.array([-1.0, 1.0]), radius_mm=0.25, motions=(*RIGID, CONTRACTION))
     points = [[0.3, 0.2, 0.4], [-0.1, 0.6, -3.0]]
-    same = basis.rigid([[3.0]], single)
+    same = basis.reproduced([[3.0]], single)
     np.testing.assert_allclose(basis.displacement(same, points), single.displacement([[3.0]], points), atol=1e-12)
 
 
 def test_a_unit_rotation_moves_a_point_at_the_radius_by_one_voxel():
     basis = SectionBasis(height_mm=np.array([0.0]), radius_mm=0.6)
     amplitude = np.zeros((1, 6))
-    amplitude[0, RIGID.index("rotation_z")] = 1
+    amplitude[0, names_of(RIGID).index("rotation_z")] = 1
     np.testing.assert_allclose(basis.displacement(amplitude, [[0.6, 0, 0.3]]), [[0, 1, 0]], atol=1e-12)
 
 

@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from pdvc.experiment import read_experiment
 from pdvc.measurement_file import read_measurement, write_measurement
-from pdvc.sections import SectionBasis
+from pdvc.sections import SectionBasis, motions_named
 from pdvc.volume import Grid, Volume, hull_of
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
@@ -150,7 +150,7 @@ def test_a_program_that_fails_is_told_in_one_line(tmp_path, programs):
 BASIS = SectionBasis(
     height_mm=np.array([-1.0, 0.0, 1.2, 2.0]),
     radius_mm=0.4,
-    motions=("translation_x", "translation_z", "rotation_y", "contraction"),
+    motions=motions_named(("translation_x", "translation_z", "rotation_y", "contraction")),
 )
 
 

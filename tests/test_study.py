@@ -56,8 +56,8 @@ repetitions = 2
 [change.options]
 section_motions = ["translation_x", "translation_y", "translation_z", "rotation_z"]
 time = [{ kind = "force" }, { kind = "angle" }, { kind = "polynomial" }]
-rigid = [{ solver = "gauss-newton", most = 2 }]
-deformation = [{ solver = "gauss-newton", most = 1 }]
+rigid = [{ solver = { kind = "gauss-newton", most_passes = 2 } }]
+deformation = [{ solver = { kind = "gauss-newton", most_passes = 1 } }]
 """
 FACTORS = """
 [[factor]]

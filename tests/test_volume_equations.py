@@ -102,7 +102,7 @@ def test_the_gradient_of_chi2_is_minus_twice_c():
 def test_beyond_the_known_height_the_last_layer_goes_on_without_a_gradient():
     reference = textured()
     pair = pair_of(reference, blank(reference), inner_mm=10.0)
-    one = SectionBasis(height_mm=[0.0], radius_mm=1.0, motions=("translation_z",))
+    one = SectionBasis(height_mm=[0.0], radius_mm=1.0, motions=(RIGID[2],))
     far = compare(pair, one, np.array([[200.0]]))
     np.testing.assert_allclose(far.residual[5][pair.used[5]], reference.values[1][pair.used[5]], atol=1e-6)
     assert far.equations().matrix[0, 0, 0] == 0

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """Hold what is asked for."""
+    """What is asked for."""
 
     scenario: Scenario
     options: MeasureOptions
@@ -64,7 +64,7 @@ class Job:
 
 @dataclass
 class State:
-    """Hold what earlier attempts did in a folder, so that the next one knows what still holds."""
+    """What earlier attempts did in a folder, so that the next one knows what still holds."""
 
     measurement: str = ""
     """Digest of software, options and experiment, every count of it, that measurement.nc belongs to."""
@@ -87,7 +87,7 @@ class State:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Hold what a run came to."""
+    """What a run came to."""
 
     measurement: Measurement
     scores: Scores

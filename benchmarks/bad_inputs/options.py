@@ -116,17 +116,19 @@ CASES = (
     ),
     BadInput(
         name="one-pass",
-        options="[[rigid]]\nscale = 2\nmost = 1\n[[deformation]]\nscale = 1\nmost = 1\n",
+        options='[[rigid]]\nscale = 2\nsolver = { kind = "pgd", most_modes = 1 }\n'
+        '[[deformation]]\nscale = 1\nsolver = { kind = "pgd", most_modes = 1 }\n',
         wrong="Each stage may find one mode, in one pass: it ends before the motion is followed.",
     ),
     BadInput(
         name="gain-never-enough",
-        options="[[rigid]]\nscale = 2\nleast_gain = 0.9\n[[deformation]]\nscale = 1\nleast_gain = 0.9\n",
+        options='[[rigid]]\nscale = 2\nsolver = { kind = "pgd", least_gain = 0.9 }\n'
+        '[[deformation]]\nscale = 1\nsolver = { kind = "pgd", least_gain = 0.9 }\n',
         wrong="A mode has to lower the residual to a tenth to be kept.",
     ),
     BadInput(
         name="scale-too-coarse",
-        options="[[rigid]]\nscale = 16\nmost = 8\n[[deformation]]\nscale = 1\n",
+        options='[[rigid]]\nscale = 16\nsolver = { kind = "pgd", most_modes = 8 }\n[[deformation]]\nscale = 1\n',
         wrong="The rigid stage sees the sample in one or two columns of pixels, and its motion is lost.",
     ),
     BadInput(
@@ -155,7 +157,7 @@ CASES = (
     BadInput(
         name="solver-unknown",
         due="error",
-        options='[[deformation]]\nscale = 1\nsolver = "newton"\n',
+        options='[[deformation]]\nscale = 1\nsolver = { kind = "newton" }\n',
         wrong="A solver is asked for that nobody knows.",
     ),
 )

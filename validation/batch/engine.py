@@ -65,7 +65,7 @@ _TYPES = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string
 
 
 class Part(Protocol):
-    """Be shared by several runs."""
+    """What several runs share."""
 
     @property
     def name(self) -> str:
@@ -80,14 +80,14 @@ class Part(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """Hold what a run found."""
+    """What a run found."""
 
     scores: Mapping[str, Scalar]
     arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
 
 class Run(Protocol):
-    """Be carried out once, anywhere."""
+    """What is carried out once, anywhere."""
 
     @property
     def key(self) -> str:

@@ -60,7 +60,7 @@ _NOT_SCORES = ("scenario", "peak_memory_gib")
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """Hold a scenario and how it is to be measured; a `validation.batch.engine.Run`."""
+    """A scenario and how it is to be measured; a `validation.batch.engine.Run`."""
 
     scenario: Scenario
     options: MeasureOptions
@@ -108,7 +108,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class CleanStack:
-    """Name a noise-free stack in the shared folder; a `validation.batch.engine.Part`."""
+    """A noise-free stack in the shared folder; a `validation.batch.engine.Part`."""
 
     scenario: Scenario
     stack: Stack
@@ -129,7 +129,7 @@ class CleanStack:
 
 @dataclass(frozen=True)
 class Volumes:
-    """Name the outline and volumes of a reference scan in the shared folder; a `validation.batch.engine.Part`."""
+    """The outline and volumes of a reference scan in the shared folder; a `validation.batch.engine.Part`."""
 
     scenario: Scenario
     options: MeasureOptions
@@ -161,7 +161,7 @@ _HOW_TO_SOLVE = {"rigid", "deformation", "weighting", "smooth_px", "subtract_sys
 
 @dataclass(frozen=True)
 class LeastError:
-    """Name the bound of a scenario in the shared folder; a `validation.batch.engine.Part`."""
+    """The bound of a scenario in the shared folder; a `validation.batch.engine.Part`."""
 
     scenario: Scenario
     options: MeasureOptions

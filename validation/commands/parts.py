@@ -51,7 +51,7 @@ Scheduler = Annotated[
 
 
 class Debugging:
-    """Hold whether errors are shown with their traceback: --debug."""
+    """Whether errors are shown with their traceback: --debug."""
 
     on = False
 

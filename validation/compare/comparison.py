@@ -45,7 +45,7 @@ SCANS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class MethodRun:
-    """Hold a scenario and the name of the method that is to measure it; a `validation.batch.engine.Run`."""
+    """A scenario and the name of the method that is to measure it; a `validation.batch.engine.Run`."""
 
     scenario: Scenario
     method: str
@@ -146,7 +146,7 @@ def gauge_mm(scenario: Scenario) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Hold what is asked for; raises SettingsError where a name is given twice, or none at all."""
+    """What is asked for; raises SettingsError where a name is given twice, or none at all."""
 
     scenarios: tuple[Scenario, ...]
     methods: tuple[Method, ...]

@@ -30,7 +30,7 @@ _MARKERS = "osD^vPX*"
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """Hold a method's place in a figure of error against cost."""
+    """A method's place in a figure of error against cost."""
 
     method: str
     cost: float

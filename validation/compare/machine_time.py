@@ -21,7 +21,7 @@ CLAIM = 100
 
 @dataclass(frozen=True, kw_only=True)
 class PerStep:
-    """Hold what one measured step costs."""
+    """What one measured step costs."""
 
     radiographs: float
     minutes: float
@@ -29,7 +29,7 @@ class PerStep:
 
 @dataclass(frozen=True, kw_only=True)
 class Gain:
-    """Hold the cost of a step by radiographs of the test, and by full scans."""
+    """The cost of a step by radiographs of the test, and by full scans."""
 
     definition: str
     projections: PerStep

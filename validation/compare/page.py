@@ -38,7 +38,7 @@ PAGE = "comparison.html"
 
 @dataclass(frozen=True, kw_only=True)
 class Chapter:
-    """Hold what the page says about one scenario."""
+    """What the page says about one scenario."""
 
     scenario: Scenario
     note: str
@@ -55,7 +55,7 @@ class Chapter:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """Hold a figure as the page shows it."""
+    """A figure as the page shows it."""
 
     name: str
     caption: str

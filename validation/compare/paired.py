@@ -36,7 +36,7 @@ QUANTITIES = ("across_beam", "vertical", "along_beam", "strain")
 
 @dataclass(frozen=True, kw_only=True)
 class FieldErrors:
-    """Hold the errors of one measurement; NaN where it did not measure."""
+    """The errors of one measurement; NaN where it did not measure."""
 
     points: NDArray[np.float32]
     """(step, point, direction): across the beam, vertical, along the beam, voxels."""
@@ -94,7 +94,7 @@ def where_all(several: Sequence[FieldErrors]) -> tuple[Mask, Mask]:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodScores:
-    """Hold what one method did in one scenario, over the repetitions."""
+    """What one method did in one scenario, over the repetitions."""
 
     scenario: str
     method: str
@@ -134,7 +134,7 @@ class MethodScores:
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """Hold how much larger one method's errors are than another's, over the repetitions that both measured."""
+    """How much larger one method's errors are than another's, over the repetitions that both measured."""
 
     scenario: str
     method: str
@@ -145,7 +145,7 @@ class Difference:
 
 @dataclass(frozen=True, kw_only=True)
 class StepErrors:
-    """Hold one method's rms errors at each step, over the repetitions."""
+    """One method's rms errors at each step, over the repetitions."""
 
     scenario: str
     method: str
@@ -155,7 +155,7 @@ class StepErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """Hold what a comparison found."""
+    """What a comparison found."""
 
     methods: tuple[MethodScores, ...]
     differences: tuple[Difference, ...]
@@ -179,7 +179,7 @@ def summarised(rows: Sequence[Mapping[str, Scalar]], folder: Path) -> Summary:
 
 
 class _Group:
-    """Hold the runs of one scenario, and their errors over what all methods of each repetition measured."""
+    """The runs of one scenario, and their errors over what all methods of each repetition measured."""
 
     def __init__(self, rows: Sequence[Mapping[str, Scalar]], folder: Path) -> None:
         self.rows = rows

@@ -21,7 +21,7 @@ _UNKNOWN = "—"
 
 @dataclass(frozen=True, kw_only=True)
 class TextTable:
-    """Hold a table as text; the first column is left-aligned, the others are right-aligned."""
+    """A table as text; the first column is left-aligned, the others are right-aligned."""
 
     caption: str
     head: tuple[str, ...]

@@ -14,7 +14,7 @@ from pdvc.experiment import Experiment, Series
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Hold what a method used."""
+    """What a method used."""
 
     radiographs: int
     minutes: float

@@ -63,7 +63,7 @@ LEAST_NODES = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Nodes:
-    """Hold the nodes that spam-ldic correlated and that converged."""
+    """The nodes that spam-ldic correlated and that converged."""
 
     point_mm: Floats
     """X (node, 3), mm, in the reference state."""

@@ -36,7 +36,7 @@ BELIEVED = {
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Hold one line of the summary table, as text."""
+    """One line of the summary table, as text."""
 
     name: str
     here: str

@@ -25,7 +25,7 @@ SHOWN = (90 / 127, 110 / 127, 123 / 127)
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """Hold a figure and what to say below it."""
+    """A figure and what to say below it."""
 
     name: str
     caption: str

@@ -20,7 +20,7 @@ _SEED = 20180704
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Hold a number and its interval; NaN where it is not known."""
+    """A number and its interval; NaN where it is not known."""
 
     value: float
     low: float = math.nan

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 class TruePoints(Protocol):
-    """Be asked for the true motion of material points."""
+    """What is asked for the true motion of material points."""
 
     @property
     def point_mm(self) -> Floats:
@@ -32,7 +32,7 @@ class TruePoints(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class CentreLine:
-    """Hold the motion of points on the axis, one at each level; NaN where it was not observed."""
+    """The motion of points on the axis, one at each level; NaN where it was not observed."""
 
     level_mm: Floats
     """Heights (level,), increasing: of the material in the reference state where a truth is known, else of

@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class CentreLineDeviation:
-    """Hold what is predicted of errors on the axis, one point at each level; NaN where nothing was observed."""
+    """What is predicted of errors on the axis, one point at each level; NaN where nothing was observed."""
 
     level_mm: Floats
     """Heights (level,), mm, as those of `validation.scoring.centre_line.CentreLine`."""

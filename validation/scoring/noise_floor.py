@@ -46,7 +46,7 @@ FEW_SIGMA = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class TrueError:
-    """Hold the error of material points on the axis, over the steps of a noise floor, rigid motion included."""
+    """The error of material points on the axis, over the steps of a noise floor, rigid motion included."""
 
     scatter_voxel: Directions
     """Deviation of each point's error from its mean over the steps, rms."""
@@ -60,7 +60,7 @@ class TrueError:
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseFloor:
-    """Hold the scatter of the measured motion over the first steps, at constant load, beyond rigid motion."""
+    """The scatter of the measured motion over the first steps, at constant load, beyond rigid motion."""
 
     steps: int
     """Steps that were measured before the load rises."""

@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Directions:
-    """Hold one number for each direction, voxels."""
+    """One number for each direction, voxels."""
 
     across_beam: float
     vertical: float
@@ -43,7 +43,7 @@ class Directions:
 
 @dataclass(frozen=True, kw_only=True)
 class Snr:
-    """Hold mean signal-to-noise ratios, dB: over the views for `reprojection`, else over the steps."""
+    """Mean signal-to-noise ratios, dB: over the views for `reprojection`, else over the steps."""
 
     reprojection: float
     initial: float
@@ -54,7 +54,7 @@ class Snr:
 
 @dataclass(frozen=True, kw_only=True)
 class Modes:
-    """Hold the number of modes that each stage of the protocol found."""
+    """The number of modes that each stage of the protocol found."""
 
     rigid: int
     deformation: int
@@ -62,7 +62,7 @@ class Modes:
 
 @dataclass(frozen=True, kw_only=True)
 class Seconds:
-    """Hold how long each part took, s; NaN where nobody noted it."""
+    """How long each part took, s; NaN where nobody noted it."""
 
     simulate: float
     reconstruct: float
@@ -71,7 +71,7 @@ class Seconds:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """Hold what `scores.json` says."""
+    """What `scores.json` says."""
 
     scenario: str
     steps: int
@@ -109,7 +109,7 @@ class Scores:
 
 @dataclass(frozen=True, kw_only=True)
 class Errors:
-    """Hold the error of each material point at each step."""
+    """The error of each material point at each step."""
 
     components: Floats
     """(step, point, direction) across the beam, vertical, along the beam, voxels; NaN where not scored."""

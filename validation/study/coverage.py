@@ -29,7 +29,7 @@ DIRECTIONS = ("across_beam", "vertical", "along_beam", "strain")
 
 @dataclass(frozen=True, kw_only=True)
 class Covered:
-    """Hold the coverage of one interval in one direction."""
+    """The coverage of one interval in one direction."""
 
     level: int
     """Due, per cent."""
@@ -42,7 +42,7 @@ class Covered:
 
 @dataclass(frozen=True, kw_only=True)
 class Honesty:
-    """Hold what the draws of one combination show."""
+    """What the draws of one combination show."""
 
     combination: dict[str, object]
     draws: int

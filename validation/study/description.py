@@ -146,7 +146,7 @@ class Study(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """Hold one combination of the factors' values."""
+    """One combination of the factors' values."""
 
     changes: tuple[tuple[str, Any], ...]
     """Path and value of all keys that factors change."""

@@ -33,7 +33,7 @@ BOUND: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
 
 @dataclass(frozen=True, kw_only=True)
 class StudyPicture:
-    """Hold a figure with what a reader has to know."""
+    """A figure with what a reader has to know."""
 
     name: str
     caption: str
@@ -42,7 +42,7 @@ class StudyPicture:
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """Hold one curve: which rows of the summary, of which part of the error, and how it is called."""
+    """One curve: which rows of the summary, of which part of the error, and how it is called."""
 
     rows: pd.DataFrame
     part: str

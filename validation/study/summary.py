@@ -39,7 +39,7 @@ RESAMPLES = 999
 
 @dataclass(frozen=True)
 class Estimate:
-    """Hold a number with the ends of its 95 % interval; NaN where it is not known."""
+    """A number with the ends of its 95 % interval; NaN where it is not known."""
 
     value: float
     low: float

@@ -86,7 +86,7 @@ def small_options(scenario: Scenario) -> MeasureOptions:
 
 @dataclass(frozen=True)
 class SmallExperiment:
-    """Hold a small scenario; what follows from it is made once and kept for the next who asks."""
+    """A small scenario; what follows from it is made once and kept for the next who asks."""
 
     scenario: Scenario
 
@@ -182,7 +182,7 @@ def hull_around(values: NDArray[np.float32], grid: Grid) -> Hull:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedCase:
-    """Hold a textured bar, a scanner, and a motion that is known; radiographs follow by pdvc's own projector.
+    """A textured bar, a scanner, and a motion that is known; radiographs follow by pdvc's own projector.
 
     The voxel of the volume is the scanner's. Time functions are sine and cosine of the angle, 1 and t: four.
     """
