@@ -1,12 +1,14 @@
 """The spatial basis against formulas written with cross products, and the laws of hat functions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pdvc.sections import CONTRACTION, RIGID, SectionBasis, names_of
+from pdvc.sections import CONTRACTION, RIGID, SectionBasis, SectionPattern, motions_named, names_of, offer_motion
 from tests.laws import law
 from validation.testing.strategies import section_bases
 
@@ -95,13 +97,27 @@ def test_contraction_moves_points_away_from_the_axis_and_not_along_it():
     np.testing.assert_allclose(u, [[1.8, -1.2, 0], [2.4, -1.6, 0]], atol=1e-12)
 
 
+ROUND = SectionPattern(name="round", gradient=((0, -2, 0), (2, 0, 0), (0, 0, 0)), shift=(1, 0, 0))
+"""A turn about an axis beside that of the stage: a sum of rigid motions."""
+
+
+def test_a_motion_is_found_by_its_name_and_a_name_is_given_once():
+    assert motions_named(("rotation_z", "translation_x")) == (RIGID[5], RIGID[0])
+    with pytest.raises(ValueError, match=r"section motions: expected some of .*contraction.*got .*rotation_w"):
+        motions_named(("rotation_w",))
+    with pytest.raises(ValueError, match="'rotation_z': expected a name that is free"):
+        offer_motion(replace(ROUND, name="rotation_z"))
+    offer_motion(CONTRACTION)  # the same again changes nothing
+    assert SectionPattern.of("round", ROUND.pattern()) == ROUND
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"height_mm": [1.0, 0.0]}, "section heights: expected increasing numbers in mm"),
         ({"height_mm": []}, "section heights: expected increasing numbers in mm"),
-        ({"motions": ("rotation_w",)}, "section motions: expected some of .*contraction"),
-        ({"motions": ()}, "section motions: expected some of"),
+        ({"motions": ()}, "section motions: expected some, none a sum of others"),
+        ({"motions": (*RIGID, ROUND)}, "section motions: expected some, none a sum of others"),
         ({"radius_mm": 0.0}, "section radius: expected a positive length in mm, got 0.0"),
     ],
 )

@@ -71,7 +71,7 @@ def test_the_distance_of_the_true_motion_from_the_space_is_told(case):
     assert told.shape == (3,)
     # seven random functions do not hold this motion; more of them hold all of it
     assert told.max() > 0.5
-    whole = replace(
+    whole = records.altered(
         measurement,
         time_functions=np.sqrt(records.STEPS) * np.eye(records.STEPS),
         covariance=np.eye(records.STEPS * 54),

@@ -1,6 +1,7 @@
 """Volume correlation of a small simulated experiment: what it finds, records, keeps, draws and refuses."""
 
 from dataclasses import fields, replace
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -59,8 +60,9 @@ def test_errors_are_of_the_size_of_the_standard_deviations(measured):
 def test_the_record_tells_which_steps_were_scanned(measured):
     held = np.zeros(18, dtype=bool)
     held[list(HELD)] = True
-    for name in ("amplitude", "amplitude_std", "snr_initial_db", "snr_rigid_db", "snr_final_db"):
-        known = np.isfinite(getattr(measured, name)).reshape(18, -1)
+    names = ("motion.amplitude", "motion.amplitude_std", "fit.snr_initial_db", "fit.snr_rigid_db", "fit.snr_final_db")
+    for name in names:
+        known = np.isfinite(attrgetter(name)(measured)).reshape(18, -1)
         np.testing.assert_array_equal(known, np.broadcast_to(held[:, None], known.shape), err_msg=name)
     points = np.zeros((4, 3))
     points[:, 2] = measured.motion.basis.height_mm
