@@ -1,46 +1,23 @@
-"""What every package of this distribution asks of the place where it runs, and the entry point of the command line.
-
-The packages have plain names. A folder of the same name that Python finds first hides one of them, and what an extra
-would bring may be missing: both are said in one line.
-"""
+"""The entry point of the command line, pdvc-bench, under a name that no user's folder has."""
 
 from __future__ import annotations
 
 import sys
-from importlib.util import find_spec
-from pathlib import Path
-
-HOME = Path(__file__).resolve().parent
-"""Where the packages lie, side by side with this file."""
-PACKAGES = ("pdvc", "simulator", "validation")
-
-
-def check_namesakes(*packages: str) -> None:
-    """Raise ImportError where another folder or module hides one of our packages."""
-    for name in packages:
-        spec = find_spec(name)
-        places = [] if spec is None else list(spec.submodule_search_locations or [spec.origin or ""])
-        if HOME / name not in [Path(place).resolve() for place in places]:
-            found = " and ".join(map(str, places)) or "nothing"
-            raise ImportError(
-                f"{name}: expected the package of pdvc-bench in {HOME}, found {found}, which hides it: rename that, "
-                "or start Python elsewhere"
-            )
-
-
-def check_extra(extra: str, *modules: str) -> None:
-    """Raise ImportError where a module is missing that an extra brings."""
-    missing = [name for name in modules if find_spec(name) is None]
-    if missing:
-        raise ImportError(
-            f"{', '.join(missing)}: expected to be installed, found not: pip install 'pdvc-bench[{extra}]'"
-        )
 
 
 def main() -> None:
-    """Run the command line, pdvc-bench."""
+    """Run the command line; where a folder of the same name hides one of our packages, say so in one line."""
     try:
-        check_namesakes(*PACKAGES)
+        from pdvc.surroundings import check_namesakes
+
+        check_namesakes("pdvc", "simulator", "validation")
+    except ModuleNotFoundError:
+        import pdvc
+
+        print(
+            f"error: pdvc: expected the package of pdvc-bench, found {pdvc.__path__}, which hides it", file=sys.stderr
+        )
+        sys.exit(1)
     except ImportError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
