@@ -56,7 +56,7 @@ def main() -> None:
                     errors.append(point_errors(found, truth).components)
                     sources.append(found.motion.std_by_source)
                     stated.append(asdict(interval_calibration(found, truth, errors[-1]).predicted))
-            least = asdict(bound.quantities(truth))
+            least = asdict(bound.quantities(truth.point_mm, truth.displacement_mm))
             for k, direction in enumerate(("across_beam", "vertical", "along_beam")):
                 predicted = np.sqrt(np.mean([each[direction] ** 2 for each in stated]))
                 square = {name: np.mean([each[name][k] ** 2 for each in sources]) for name in sources[0]}

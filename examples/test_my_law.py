@@ -29,6 +29,6 @@ def never_loaded(scenario):
 @settings(max_examples=2, deadline=None, derandomize=True)
 @given(scenarios(least_ingredients=2).map(never_loaded).map(SmallExperiment))
 def test_a_sample_that_is_not_loaded_does_not_stretch(small):
-    """Sections are some 15 voxels apart: a strain of a hundredth is 0.15 voxel between two of them."""
+    """Sections are some 15 voxels apart: a strain of three hundredths is half a voxel between two of them."""
     centre = centre_line(small.measurement)
-    assert np.abs(centre.strain(centre.measured)).max() < 0.01
+    assert np.abs(centre.strain(centre.measured)).max() < 0.03
