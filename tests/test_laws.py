@@ -254,6 +254,6 @@ def test_with_fewer_photons_the_bound_grows_in_every_direction_and_no_more_than_
     bright, _ = bound_of(scenario, small.options)
     dim, _ = bound_of(scenario.model_copy(update={"detector": detector}), small.options)
     # whatever is asked of the unknowns, not only each of them by itself: generalised eigenvalues
-    growth = linalg.eigh(dim.motion.covariance, bright.motion.covariance, eigvals_only=True)
+    growth = linalg.eigh(dim.covariance, bright.covariance, eigvals_only=True)
     assert growth.min() > 1
     assert growth.max() < fewer

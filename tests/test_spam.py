@@ -218,7 +218,7 @@ def test_the_method_measures_the_scans_that_spam_finds(held, tmp_path, monkeypat
     monkeypatch.setattr(room, "correlated", follow)
     method = find_method("spam")
     assert method.looks_at == "volumes"
-    measurement = method.function(read_experiment(held))
+    measurement = method.measure(read_experiment(held))
     assert "step 12: 405 of 500 nodes converged" in measurement.fit.stages[0].stop_reason
     assert "step 24: spam-reg did not converge" in measurement.fit.stages[0].stop_reason
     assert {spacing for _, _, spacing in asked} == {3}  # half the distance of two sections
@@ -229,14 +229,14 @@ def test_the_method_measures_the_scans_that_spam_finds(held, tmp_path, monkeypat
         # 15 sections between which the truth bends a little
         assert getattr(scores.error_voxel, name) < 0.01
     write_measurement(measurement, tmp_path / "m.nc")
-    np.testing.assert_array_equal(read_measurement(tmp_path / "m.nc").amplitude, measurement.motion.amplitude)
+    np.testing.assert_array_equal(read_measurement(tmp_path / "m.nc").motion.amplitude, measurement.motion.amplitude)
 
 
 def test_where_spam_finds_nothing_the_method_says_so(held, monkeypatch, programs):
     programs(2)
     monkeypatch.setattr(room, "correlated", lambda *_: None)
     with pytest.raises(ValueError, match="step 12: spam-reg did not converge; step 24"):
-        find_method("spam").function(read_experiment(held))
+        find_method("spam").measure(read_experiment(held))
 
 
 @pytest.mark.skipif(not all(shutil.which(name) for name in PROGRAMS), reason="spam is not installed")
