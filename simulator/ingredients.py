@@ -7,7 +7,9 @@ They are carried out in this order, from the material outwards:
 2. ``compliance``: the machine gives way to the force, by a shift and a tilt;
 3. ``backlash``: it moves between reference scan and test, and again when the stroke starts;
 4. ``wobble``: the stage turns about another axis than during the reference scan. Fixed in the lab, this is a
-   sine and a cosine of the stage angle in the sample frame.
+   sine and a cosine of the stage angle in the sample frame;
+5. only where a scenario asks for them: ``creep``, with the deformations, and ``wander``, a random motion of the whole.
+   No time function follows them.
 
 One more is one more record here, a `Deforming` or a `Moving` one, and its field in `MotionOptions`.
 
@@ -207,6 +209,59 @@ class Wobble(Moving):
         )
 
 
+class Creep(Deforming):
+    """A stretch that goes on with the logarithm of time since the stroke started, where the section is small."""
+
+    strain: float = 2e-3
+    """strain of the smallest section at the last step, without unit"""
+    time_s: Annotated[float, Field(gt=0)] = 20.0
+    """time constant tau of log(1 + t / tau), s"""
+
+    def deformation(self, drive: Drive) -> Deformation:
+        """Return a strain that falls off with the fourth power of the section, at constant volume."""
+        history = drive.history
+        since = np.clip(history.time_s - history.time_s[drive.start_step], 0.0, None)
+        course = np.log1p(since / self.time_s)
+        course /= course[-1] if course[-1] > 0 else 1.0
+        strain = self.strain * course[:, None] * (drive.area_mm2.min() / drive.area_mm2) ** 4
+        return Deformation(strain=strain, stretch=1 / np.sqrt(1 + strain))
+
+
+class Wander(Moving):
+    """A random motion of the sample as a whole, which no time function describes: drift, slow wandering, and slips."""
+
+    draw: Annotated[int, Field(ge=0)] = 0
+    """which one: another number is another motion"""
+    shift_mm: float = 0.01
+    """rms of the slow part of the shift along each axis, mm"""
+    tilt_deg: float = 0.01
+    """the same of the rotation vector, degrees"""
+    steps: Annotated[float, Field(gt=0)] = 15.0
+    """steps over which the slow part changes"""
+    drift_mm: float = 0.01
+    """rms of a steady drift along each axis, over the whole test, mm"""
+    slips: Annotated[int, Field(ge=0, le=32)] = 2
+    """sudden shifts, at random steps"""
+    slip_mm: float = 0.01
+    """rms of each slip along each axis, mm"""
+
+    def motion(self, drive: Drive) -> RigidMotion:
+        """Return a Gaussian process of squared-exponential covariance, zero at the first step, drift, and slips."""
+        rng, count = np.random.default_rng(np.random.SeedSequence(self.draw)), len(drive.angle_rad)
+        step = np.arange(count)
+        covariance = np.exp(-(((step[:, None] - step) / self.steps) ** 2) / 2) + 1e-9 * np.eye(count)
+        slow = np.linalg.cholesky(covariance) @ rng.normal(size=(count, 6))
+        slow -= slow[0]
+        drift = rng.normal(size=3) * (step / max(count - 1, 1))[:, None]
+        # drawn whether asked for or not, so that one more slip leaves the others as they were
+        at, size = rng.integers(1, max(count, 2), size=32), rng.normal(size=(32, 3))
+        slips = ((step[:, None] >= at[: self.slips])[..., None] * size[: self.slips]).sum(axis=1)
+        return RigidMotion(
+            rotation_rad=np.deg2rad(self.tilt_deg) * slow[:, 3:],
+            translation_mm=self.shift_mm * slow[:, :3] + self.drift_mm * drift + self.slip_mm * slips,
+        )
+
+
 def _known(name: str) -> str:
     names = [repr(each) for each in MotionOptions.names()]
     if repr(name) not in names:
@@ -240,6 +295,10 @@ class MotionOptions(Settings):
     """motion before the test and at the start of the stroke"""
     wobble: Wobble = Wobble()
     """another axis of rotation than in the reference scan"""
+    creep: Creep = Creep()
+    """stretch that goes on with the logarithm of time"""
+    wander: Wander = Wander()
+    """random motion of the sample as a whole"""
 
     @field_validator("sections")
     @classmethod

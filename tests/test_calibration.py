@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from pdvc.experiment import read_experiment
 from pdvc.measurement import Measurement
@@ -15,7 +16,13 @@ from simulator.scanner import simulate
 from tests import synthetic_records as records
 from tests.tiny_scenarios import trial
 from validation.scoring.bound import bound_of
-from validation.scoring.interval_calibration import interval_calibration, true_coefficients
+from validation.scoring.interval_calibration import (
+    ONSET_STEPS,
+    crps,
+    interval_calibration,
+    phase_steps,
+    true_coefficients,
+)
 from validation.scoring.scores import point_errors
 
 SECTIONS, MOTIONS, FUNCTIONS = 4, 6, 3
@@ -134,3 +141,47 @@ def test_the_bound_falls_with_the_root_of_frames(tmp_path):
     less, usual = (each.quantities(truth.point_mm, truth.displacement_mm) for each in (fourfold, once))
     np.testing.assert_allclose(less.across_beam, usual.across_beam / 2, rtol=1e-3)
     np.testing.assert_allclose(less.vertical, usual.vertical / 2, rtol=1e-3)
+
+
+def test_the_score_of_a_normal_distribution_is_its_integral():
+    """CRPS is the integral of (Phi((x - m) / s) - [x >= y])^2 over x, by quadrature."""
+    error, deviation = np.array([0.0, 0.3, -1.2, 4.0]), np.array([1.0, 0.2, 0.5, 1.5])
+    x = np.linspace(-40, 40, 400_001)
+    expected = [
+        np.trapezoid((stats.norm.cdf(x / s) - (x >= e)) ** 2, x) for e, s in zip(error, deviation, strict=True)
+    ]
+    np.testing.assert_allclose(crps(error, deviation), expected, rtol=1e-3)
+    assert len(crps(np.array([np.nan, 1.0, 1.0]), np.array([1.0, 0.0, 1.0]))) == 1
+
+
+def test_neither_wide_nor_narrow_intervals_win():
+    error = np.random.default_rng(4).normal(size=20_000)
+    scores = [crps(error, np.full_like(error, factor)).mean() for factor in (0.5, 0.9, 1.0, 1.1, 2.0)]
+    assert np.argmin(scores) == 2
+
+
+def test_phases_follow_the_force():
+    """A plateau of 20 steps, and then the load: ten steps of onset, and the rest."""
+    step = np.arange(60)
+    found = phase_steps(250.0 + 12.0 * np.clip(step - 20, 0, None))
+    assert {name: (here.nonzero()[0][0], here.sum()) for name, here in found.items()} == {
+        "plateau": (0, 21),
+        "onset": (21, ONSET_STEPS),
+        "loading": (31, 29),
+    }
+    still = phase_steps(np.full(30, 250.0))
+    assert still["plateau"].all()
+    assert not (still["onset"] | still["loading"]).any()
+
+
+def test_an_error_that_comes_with_the_load_shows_in_its_phase_alone():
+    exact = known_motion(np.random.default_rng(3))
+    truth, (low, high) = truth_of(exact), np.array([12, 23])
+    exact = records.altered(exact, force_N=250.0 + 50.0 * np.clip(np.arange(records.STEPS) - low, 0, None))
+    amplitude = exact.motion.amplitude.copy()
+    amplitude[high:] += 1.0
+    wrong = records.altered(exact, amplitude=amplitude)
+    phases = interval_calibration(wrong, truth, point_errors(wrong, truth).components).phases
+    assert phases.plateau.coverage_95.vertical == 1.0
+    assert phases.loading.coverage_95.vertical == 0.0
+    assert phases.loading.z_rms.vertical > 10 * phases.onset.z_rms.vertical

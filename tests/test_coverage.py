@@ -59,6 +59,27 @@ def test_intervals_that_are_too_small_are_called_so_with_their_factor():
     assert "outside" in said
 
 
+def test_draws_that_differ_in_all_they_may_are_pooled():
+    """Each combination is one draw, of another motion: coverage is asked of all of them together."""
+    table = table_of().assign(angle=np.arange(DRAWS))
+    factor = {"key": "scenario.motion.bending.angle_deg", "name": "angle", "low": 0.0, "high": 1.0}
+    study = Study.parse(
+        {
+            "name": "made-up",
+            "repetitions": 1,
+            "design": "latin-hypercube",
+            "samples": DRAWS,
+            "pooled": True,
+            "factor": [factor],
+        },
+        where="here",
+    )
+    (found,) = honesty(study, table)
+    (noise,) = honesty(STUDY, table)
+    assert (found.draws, found.covered, found.z_rms) == (DRAWS, noise.covered, noise.z_rms)
+    assert len(honesty(study.model_copy(update={"pooled": False}), table)) == DRAWS
+
+
 def test_failed_runs_do_not_count():
     table = table_of()
     table.loc[:9, "status"] = "failed"

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -6,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from simulator.ingredients import Bending, Compliance, Drive, MotionOptions, Moving, Torsion, Wobble
+from simulator.ingredients import Bending, Compliance, Creep, Drive, MotionOptions, Moving, Torsion, Wander, Wobble
 from simulator.kinematics import BeamMotion, Composition, MotionError, RigidMotion, SectionMotion, rotation_matrix
 from simulator.loading import Loading, load_history
 from simulator.solver_space import into_sections, time_functions
@@ -189,6 +190,46 @@ def test_wobble_stands_still_in_the_lab():
     for step in (0, 13, 77):
         lab = Rotation.from_rotvec([0, 0, ANGLE[step]]).apply(motion.forward(np.zeros((1, 3)), step)[0])
         np.testing.assert_allclose(lab, [0.02, -0.05, 0.0], atol=1e-15)  # along +x, and to the right: -y
+
+
+def test_creep_is_a_logarithm_of_time_and_keeps_the_volume():
+    (motion,) = paper_motion(ingredients=("creep",), creep=Creep(strain=3e-3, time_s=10.0)).motions
+    waist = np.argmin(AREA)
+    axis = np.zeros((2, 3))
+    axis[:, 2] = HEIGHT[waist] + np.array([-1e-3, 1e-3])
+
+    def strain(step):
+        return (np.diff(motion.forward(axis, step)[:, 2]) / np.diff(axis[:, 2]) - 1)[0]
+
+    assert strain(50) == pytest.approx(0, abs=1e-12)
+    assert strain(126) == pytest.approx(3e-3, rel=1e-4)
+    since = HISTORY.time_s - HISTORY.time_s[50]
+    assert strain(80) / strain(126) == pytest.approx(np.log1p(since[80] / 10) / np.log1p(since[126] / 10), rel=1e-4)
+    np.testing.assert_allclose(motion.stretch[126, waist] ** 2 * (1 + 3e-3), 1, rtol=1e-9)
+
+
+def test_wandering_has_the_size_and_the_slowness_that_are_asked_for():
+    """Over many draws: the slow part's variance of a difference is 2 s^2 (1 - exp(-d^2 / 2 l^2))."""
+    still = {"drift_mm": 0.0, "slips": 0, "tilt_deg": 0.0}
+    draws = np.stack(
+        [Wander(draw=n, shift_mm=0.5, steps=10.0, **still).motion(DRIVE).translation_mm for n in range(300)]
+    )
+    for lag in (1, 5, 60):
+        found = ((draws[:, lag:] - draws[:, :-lag]) ** 2).mean()
+        assert found == pytest.approx(2 * 0.25 * (1 - np.exp(-((lag / 10) ** 2) / 2)), rel=0.1)
+    np.testing.assert_array_equal(draws[:, 0], 0)
+    assert np.array_equal(Wander(draw=7).motion(DRIVE).translation_mm, Wander(draw=7).motion(DRIVE).translation_mm)
+    assert not np.array_equal(Wander(draw=7).motion(DRIVE).translation_mm, Wander(draw=8).motion(DRIVE).translation_mm)
+
+
+def test_one_more_slip_leaves_the_others_where_they_were():
+    still = {"drift_mm": 0.0, "shift_mm": 0.0, "tilt_deg": 0.0, "draw": 3}
+    paths = [Wander(slips=n, **still).motion(DRIVE).translation_mm for n in range(4)]
+    for n, path in enumerate(paths):
+        assert len(np.unique(path, axis=0)) == n + 1
+    for fewer, more in pairwise(paths):
+        jump = np.unique(np.round(more - fewer, 12), axis=0)
+        assert len(jump) == 2
 
 
 def test_one_more_ingredient_is_a_record_and_a_field():

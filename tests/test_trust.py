@@ -14,6 +14,7 @@ from validation.report.sentences import (
     calibration_sentences,
     nees_sentence,
     noise_known,
+    phase_table,
     residual_sentences,
     trust_table,
 )
@@ -50,7 +51,11 @@ def test_the_table_tells_what_the_scores_tell(case):
     assert float(table[1][2]) == pytest.approx(0.03, abs=1e-4)
     assert float(table[1][1]) == pytest.approx(scores.calibration.predicted.vertical, abs=1e-4)
     assert float(table[3][1]) == pytest.approx(100 * scores.calibration.predicted.strain, abs=1e-4)
-    assert table[0][4:] == ["100", "100", "100"]  # no error at all
+    assert table[0][4:7] == ["100", "100", "100"]  # no error at all
+    assert float(table[1][7]) == pytest.approx(scores.calibration.crps.vertical, abs=1e-4)
+    rows = phase_table(scores)
+    assert [row[0] for row in rows] == ["across the beam", "vertically", "along the beam", "in strain"]
+    assert rows[0][1:] == ["0.00, 100"] * 3
 
 
 def test_an_interval_too_small_is_told_with_its_factor_and_why(case):

@@ -18,10 +18,12 @@ from validation.report.sentences import (
     calibration_sentences,
     nees_sentence,
     noise_known,
+    phase_table,
     residual_sentences,
     trust_table,
 )
 from validation.scoring.centre_line import TruePoints, centre_line, nan_mean
+from validation.scoring.interval_calibration import ONSET_STEPS
 from validation.scoring.noise_floor import LEAST_STEPS, NoiseFloor, noise_floor
 from validation.scoring.scores import Directions, Scores, mean_snr, modes_found
 
@@ -92,6 +94,8 @@ def _page(
         rows=summary_rows(measurement, scores),
         errors=_error_table(scores, measurement.recording.voxel_mm * 1e3) if scores else [],
         trust=trust_table(scores) if scores else [],
+        phases=phase_table(scores) if scores else [],
+        onset_steps=ONSET_STEPS,
         nees=nees_sentence(scores.calibration) if scores else "",
         calibration=calibration_sentences(measurement, scores, truth) if scores else [],
         residual=residual_sentences(

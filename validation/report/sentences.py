@@ -33,7 +33,7 @@ _NAMES = {
 
 
 def trust_table(scores: Scores) -> list[list[str]]:
-    """Return a line for each direction and for the strain: predicted, observed, z rms and coverages, as text."""
+    """Return a line for each direction and for the strain: predicted, observed, z rms, coverages and CRPS, as text."""
     c = scores.calibration
     lines = []
     for key, name in (("across_beam", "across the beam, voxel"), ("vertical", "vertical, voxel"),
@@ -45,8 +45,22 @@ def trust_table(scores: Scores) -> list[list[str]]:
             [name, _number(getattr(c.predicted, key) * factor, 4), _number(observed * factor, 4)]
             + [_number(getattr(c.z_rms, key), 2)]
             + [_number(getattr(part, key) * 100, 0) for part in (c.coverage_50, c.coverage_90, c.coverage_95)]
+            + [_number(getattr(c.crps, key) * factor, 4)]
         )
     return lines
+
+
+def phase_table(scores: Scores) -> list[list[str]]:
+    """Return a line for each direction and for the strain: z rms and coverage of 95 % intervals in each phase."""
+    phases = scores.calibration.phases
+    return [
+        [name]
+        + [
+            f"{_number(getattr(phase.z_rms, key), 2)}, {_number(getattr(phase.coverage_95, key) * 100, 0)}"
+            for phase in (phases.plateau, phases.onset, phases.loading)
+        ]
+        for key, name in _NAMES.items()
+    ]
 
 
 def nees_sentence(found: IntervalCalibration) -> str:

@@ -4,6 +4,11 @@ With e an error, s the standard deviation that the measurement gives it (`pdvc.u
 
 - coverage: the share of |z| below 0.674, 1.645 and 1.960, where 50, 90 and 95 % are due;
 - z rms: 1 is due; what is more says by which factor the interval is too small;
+- CRPS, the continuous ranked probability score of the stated normal distribution: with Phi and phi the standard normal
+  distribution and density, s [z (2 Phi(z) - 1) + 2 phi(z) - 1 / sqrt(pi)], in the unit of the error and lower where it
+  is better. An interval that is wide for nothing loses by it, as one that is too narrow does;
+- the same by phase: at the plateau, over the first steps of loading, and after these. Errors of the model come and go
+  with what the sample does, noise does not;
 - NEES, the normalised estimation error squared: d^T C^-1 d, with d the error of all coefficients of observed sections
   and C their covariance. It follows chi-square with as many degrees of freedom if C is right.
 
@@ -17,6 +22,7 @@ is not in the basis' span, d lacks what no coefficients could follow.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +31,7 @@ from scipy import linalg, stats
 
 from pdvc.deviations import Quantities
 from pdvc.measurement import Measurement
+from pdvc.onset import onset
 from pdvc.sections import SectionBasis
 from validation.scoring.centre_line import TruePoints, current_positions
 from validation.scoring.deviations import centre_line_deviation
@@ -32,6 +39,25 @@ from validation.scoring.deviations import centre_line_deviation
 Floats = NDArray[np.float64]
 
 LEVELS = (0.50, 0.90, 0.95)
+ONSET_STEPS = 10
+"""Steps that count as the onset of loading: slack is taken up, and histories have a corner."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """What some of the steps show."""
+
+    z_rms: Quantities
+    coverage_95: Quantities
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phases:
+    """The parts of a test, by its force; where that has no onset all steps are one plateau, and the others NaN."""
+
+    plateau: Phase
+    onset: Phase
+    loading: Phase
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +70,9 @@ class IntervalCalibration:
     coverage_50: Quantities
     coverage_90: Quantities
     coverage_95: Quantities
+    crps: Quantities
+    """continuous ranked probability score, mean over points and steps: voxels, and strain without unit"""
+    phases: Phases
     nees: float
     """normalised estimation error squared of all observed coefficients"""
     nees_unknowns: int
@@ -60,22 +89,56 @@ def interval_calibration(measurement: Measurement, truth: TruePoints, errors: Fl
     groups = [(errors[..., k], deviations[..., k]) for k in range(3)] + [(centre.strain_error, centre.strain_std)]
     scores = [_z(error, deviation) for error, deviation in groups]
     nees, unknowns = _nees(measurement, truth)
-
-    def each(values: list[float]) -> Quantities:
-        across, vertical, along, of_strain = values
-        return Quantities(across_beam=across, vertical=vertical, along_beam=along, strain=of_strain)
-
-    half = {level: float(stats.norm.ppf((1 + level) / 2)) for level in LEVELS}
-    coverage = {level: each([_mean(np.abs(z) < half[level]) for z in scores]) for level in LEVELS}
+    coverage = {level: _covered(scores, level) for level in LEVELS}
     return IntervalCalibration(
-        predicted=each([math.sqrt(_mean(d[np.isfinite(d)] ** 2)) for _, d in groups]),
-        z_rms=each([math.sqrt(_mean(z**2)) for z in scores]),
+        predicted=_each([math.sqrt(_mean(d[np.isfinite(d)] ** 2)) for _, d in groups]),
+        z_rms=_z_rms(scores),
         coverage_50=coverage[0.50],
         coverage_90=coverage[0.90],
         coverage_95=coverage[0.95],
+        crps=_each([_mean(crps(error, deviation)) for error, deviation in groups]),
+        phases=_phases(groups, phase_steps(measurement.recording.force_N)),
         nees=nees,
         nees_unknowns=unknowns,
     )
+
+
+def crps(error: Floats, deviation: Floats) -> Floats:
+    """Return the continuous ranked probability score of normal distributions, where both are known (number,)."""
+    known = np.isfinite(error) & (deviation > 0)
+    z, spread = error[known] / deviation[known], deviation[known]
+    score = z * (2 * stats.norm.cdf(z) - 1) + 2 * stats.norm.pdf(z) - 1 / math.sqrt(math.pi)
+    return np.asarray(spread * score)
+
+
+def phase_steps(force_N: Floats) -> dict[str, NDArray[np.bool_]]:
+    """Return which steps (step,) belong to each phase of a test."""
+    step, found = np.arange(len(force_N)), onset(force_N)
+    last = len(force_N) if found is None else found
+    plateau, begun = step <= last, step <= last + ONSET_STEPS
+    return {"plateau": plateau, "onset": begun & ~plateau, "loading": ~begun}
+
+
+def _phases(groups: Sequence[tuple[Floats, Floats]], steps: Mapping[str, NDArray[np.bool_]]) -> Phases:
+    found = {}
+    for name, here in steps.items():
+        scores = [_z(error[here], deviation[here]) for error, deviation in groups]
+        found[name] = Phase(z_rms=_z_rms(scores), coverage_95=_covered(scores, 0.95))
+    return Phases(**found)
+
+
+def _each(values: Sequence[float]) -> Quantities:
+    across, vertical, along, of_strain = values
+    return Quantities(across_beam=across, vertical=vertical, along_beam=along, strain=of_strain)
+
+
+def _z_rms(scores: Sequence[Floats]) -> Quantities:
+    return _each([math.sqrt(_mean(z**2)) for z in scores])
+
+
+def _covered(scores: Sequence[Floats], level: float) -> Quantities:
+    half = float(stats.norm.ppf((1 + level) / 2))
+    return _each([_mean(np.abs(z) < half) for z in scores])
 
 
 def true_coefficients(

@@ -1,4 +1,4 @@
-"""Whether the uncertainties that a measurement states are right, over the noise draws of a study.
+"""Whether the uncertainties that a measurement states are right, over the draws of a study: noise alone, or all.
 
 Each draw contributes the shares of its errors that the 50, 90 and 95 % intervals cover, its mean z^2, and its NEES
 (`validation.scoring.interval_calibration`). Averaged over the draws:
@@ -60,10 +60,11 @@ class Honesty:
 
 
 def honesty(study: Study, table: pd.DataFrame) -> list[Honesty]:
-    """Return what the finished runs of each combination show; nothing where a table has no such columns."""
+    """Return what the finished runs of each combination show, or of all together; nothing without such columns."""
     if "calibration_nees" not in table:
         return []
-    return [_of(combination, runs[runs["status"] == "done"]) for combination, runs in by_combination(study, table)]
+    groups = [({}, table)] if study.pooled else list(by_combination(study, table))
+    return [_of(combination, runs[runs["status"] == "done"]) for combination, runs in groups]
 
 
 def _of(combination: dict[str, object], runs: pd.DataFrame) -> Honesty:

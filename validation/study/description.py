@@ -121,6 +121,8 @@ class Study(Settings):
     """how the values of several factors are combined"""
     samples: Annotated[int, Field(ge=1, le=100_000)] | None = None
     """combinations of a Latin hypercube"""
+    pooled: bool = False
+    """whether coverage is asked of all combinations together, each one draw of what may happen"""
     factor: tuple[Factor, ...] = ()
     """what varies; without any, the base is repeated"""
 
