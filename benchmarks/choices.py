@@ -11,8 +11,8 @@ from pathlib import Path
 from benchmarks.rows import Row, keep, show
 from pdvc.experiment import read_experiment
 from pdvc.history import PAPER
-from pdvc.options import paper_options
-from pdvc.protocol import MeasureOptions, measure
+from pdvc.options import MeasureOptions, paper_options
+from pdvc.protocol import measure
 from pdvc.sections import RIGID, names_of
 from simulator.scanner import simulate
 from simulator.scenario import load_scenario

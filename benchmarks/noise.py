@@ -10,7 +10,8 @@ from pathlib import Path
 
 from benchmarks.rows import Row, keep, show
 from pdvc.experiment import read_experiment
-from pdvc.protocol import MeasureOptions, measure
+from pdvc.options import MeasureOptions
+from pdvc.protocol import measure
 from simulator.scanner import simulate
 from simulator.scenario import Scenario, load_scenario
 from simulator.truth import read_truth

@@ -17,8 +17,9 @@ from benchmarks import rtk, stored
 from benchmarks.case import Case, amplitude, case
 from benchmarks.timing import Seconds, in_turns, machine, once, with_threads
 from pdvc.experiment import read_experiment
+from pdvc.options import MeasureOptions
 from pdvc.projection import normal_equations
-from pdvc.protocol import MeasureOptions, measure
+from pdvc.protocol import measure
 from pdvc.reconstruction import fdk
 from simulator.images import prepare
 from simulator.radiography import path_lengths
@@ -199,7 +200,7 @@ def _measurement(rows: Rows) -> None:
         seconds, _ = once(lambda: simulate(scenario, Path(folder)))
         rows.add("simulate quick", f"{plan.reference_views} + {plan.test_steps} radiographs", 2, seconds)
         result = measure(read_experiment(Path(folder)), MeasureOptions())
-    for name, wall in result.seconds.items():
+    for name, wall in result.provenance.seconds.items():
         size = f"{plan.test_steps} steps, 15 sections x 7 motions"
         rows.add(f"measure quick: {name}", size, 2, Seconds(wall, np.nan))
 

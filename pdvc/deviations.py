@@ -11,6 +11,9 @@ from pdvc.sections import SectionBasis
 
 Floats = NDArray[np.float64]
 
+BEAM = ("across", "vertical", "along")
+"""Names of the rows of `beam_frame`: directions in which one radiograph sees differently well."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Quantities:
@@ -33,7 +36,7 @@ class Knowledge:
     """(step,)"""
     voxel_mm: float
     covariance: Floats
-    """voxel^2, as of `pdvc.measurement.Motion`."""
+    """voxel^2, as of `pdvc.measurement.MeasuredMotion`."""
 
     def quantities(self, point_mm: Floats, displacement_mm: Floats) -> Quantities:
         """Return rms standard deviations over steps and those material points that are between the sections.

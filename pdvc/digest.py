@@ -10,12 +10,14 @@ import hashlib
 import inspect
 import platform
 import struct
-from collections.abc import Mapping
+import types
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from importlib.metadata import version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,8 @@ from pydantic import BaseModel
 
 COMPUTING = ("numpy", "scipy", "numba")
 """The libraries that results depend on, to the last digit."""
+COMMON = ("abc", "builtins", "pydantic", "typing")
+"""Of these all there is belongs to the version of Python, or of a library."""
 OWN = ("pdvc", "simulator", "validation")
 """The packages whose text counts as a whole, as `software`."""
 _AT_ONCE = 1 << 24
@@ -101,22 +105,44 @@ def _add_record(found: Any, record: Any, names: Any) -> None:
     if type(record).__module__.partition(".")[0] not in OWN:
         # what a user's own kind of time function, or solver, does is part of what it is
         kind: type = type(record)
-        _head(found, "code", _code_of(kind))
+        _head(found, "code", source_of(kind))
     for name in names:
         _add(found, name)
         _add(found, getattr(record, name))
 
 
 @cache
-def _code_of(kind: type) -> str:
-    """Return the text of a class, or, where that is nowhere kept, the code that its functions were compiled to."""
+def source_of(kind: Callable[..., Any] | type) -> str:
+    """Return the text of the file that defines a class or a function, or its compiled code where there is no file.
+
+    Of a class also the files of those that it is derived from, but not of what all these import.
+    """
+    if not isinstance(kind, type):
+        return _text(kind)
+    theirs = [each for each in kind.__mro__ if each.__module__.partition(".")[0] not in (*OWN, *COMMON)]
+    return "\n".join(_text(each) for each in theirs)
+
+
+def _text(thing: Any) -> str:
     try:
-        return inspect.getsource(kind)
-    except (OSError, TypeError):
-        functions = (part for part in vars(kind).values() if inspect.isfunction(part))
-        return "\n".join(
-            f"{part.__name__} {part.__code__.co_code.hex()} {part.__code__.co_consts}" for part in functions
-        )
+        path = inspect.getsourcefile(inspect.unwrap(thing))
+    except TypeError:
+        path = None
+    if path is not None and Path(path).is_file():
+        return Path(path).read_text(encoding="utf-8")
+    parts = vars(thing).values() if isinstance(thing, type) else [thing]
+    codes = [getattr(inspect.unwrap(getattr(part, "fget", part)), "__code__", None) for part in map(_bare, parts)]
+    return "\n".join(_compiled(code) for code in codes if code is not None)
+
+
+def _bare(part: Any) -> Any:
+    return part.__func__ if isinstance(part, classmethod | staticmethod) else part
+
+
+def _compiled(code: types.CodeType) -> str:
+    """Return all that a function's code says, and that of the functions within it."""
+    consts = [_compiled(each) if isinstance(each, types.CodeType) else repr(each) for each in code.co_consts]
+    return f"{code.co_name} {code.co_names} {code.co_varnames} {code.co_code.hex()} {consts}"
 
 
 def _head(found: Any, kind: str, text: str) -> None:

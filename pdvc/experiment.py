@@ -227,7 +227,7 @@ def read_experiment(folder: Path | str, *, planned: bool = False) -> Experiment:
                 step=entry.step,
                 series=_series(folder, interrupted_stack(n), entry, f"interrupted.{n}", geometry),
             )
-            for n, entry in enumerate(description.interrupted)
+            for n, entry in enumerate(() if planned else description.interrupted)
         ),
     )
 

@@ -23,7 +23,7 @@ from pdvc.window import scan_grid
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cost:
+class Forecast:
     """What a measurement is expected to take on this machine, to about a factor of two."""
 
     seconds: float
@@ -38,7 +38,7 @@ class Inspection:
     found: Examination
     window: tuple[int, int, int, int]
     """Proposed rows and columns: row_from, row_to, column_from, column_to."""
-    cost: Cost
+    cost: Forecast
     doubts: tuple[Doubt, ...]
 
 
@@ -59,7 +59,7 @@ def inspect(experiment: Experiment, options: MeasureOptions = DEFAULT, *, progre
     )
 
 
-def _cost(setup: Setup, outlining_s: float, progress: Progress) -> Cost:
+def _cost(setup: Setup, outlining_s: float, progress: Progress) -> Forecast:
     """Time one radiograph on a volume as large as that of scale 1, and count passes, voxels and pixels."""
     experiment, geometry, window, basis = setup.experiment, setup.geometry, setup.window, setup.sections
     steps, hull = len(experiment.test), setup.outline.hull
@@ -85,7 +85,7 @@ def _cost(setup: Setup, outlining_s: float, progress: Progress) -> Cost:
     pixels = float(geometry.rows * geometry.columns)
     memory = 8 * voxels + 4 * pixels * len(reference) / 2 + 24 * steps * target.size
     memory += memory_bytes(time_functions, basis)
-    return Cost(
+    return Forecast(
         seconds=pass_s * passes + outlining_s * (1 + finer / 2),
         memory_gib=memory / 2**30 + 0.3,
         unknowns=len(time_functions) * basis.shape[0] * basis.shape[1],

@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from pdvc.deviations import BEAM
 from pdvc.measurement import (
     Fit,
     MeasuredMotion,
@@ -99,7 +100,7 @@ def dataset_of(measurement: Measurement) -> xr.Dataset:
             "displacement_std": (("step", "section", "direction"), _axis_std(m), {"units": "voxel"}),
             "strain_std": (("step", "interval"), _axis_strain_std(m)),
         },
-        coords={"motion": list(m.motion.basis.names), "direction": ["across", "vertical", "along"]},
+        coords={"motion": list(m.motion.basis.names), "direction": list(BEAM)},
         attrs={
             "format": FORMAT,
             **{name: attrgetter(attribute)(m) for name, attribute in _NUMBERS.items()},

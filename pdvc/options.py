@@ -100,6 +100,11 @@ class MeasureOptions(Settings):
     prior_voxel: Annotated[float, Field(gt=0)] = 30.0
     """standard deviation of every amplitude before the data, voxels (rms over the steps)"""
 
+    @property
+    def motions(self) -> tuple[SectionPattern, ...]:
+        """Return what the names of the section motions stand for; it counts where a result is kept."""
+        return motions_of(self.section_motions)
+
     @field_validator("rigid")
     @classmethod
     def _at_least_one(cls, stages: tuple[StageOptions, ...]) -> tuple[StageOptions, ...]:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.deviations import Knowledge, beam_frame
+from pdvc.digest import digest
 from pdvc.equations import STEPS_AT_ONCE, Images, linearise
 from pdvc.experiment import Experiment, Series
 from pdvc.gauss_newton import hessian
@@ -109,7 +110,7 @@ class Planner:
         self._variance = left * float(
             np.mean([noise.step(t).variance.mean() for t in range(len(self._reference_rad))])
         )
-        self._worked_out: dict[bytes, tuple[Floats, Floats, Floats]] = {}
+        self._worked_out: dict[str, tuple[Floats, Floats, Floats]] = {}
 
     @property
     def heights_mm(self) -> tuple[float, float]:
@@ -147,8 +148,7 @@ class Planner:
 
     def _sums(self, basis: SectionBasis, functions: Floats, test: PlannedTest) -> tuple[Floats, Floats, Floats]:
         """Return H, V of all images but the flats, and V of the flats, with the reference scan's frames and flats."""
-        parts = (basis.height_mm, functions, test.angle_rad, test.moved_mm)
-        key = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+        key = digest(basis, functions, test.angle_rad, test.moved_mm)
         if key not in self._worked_out:
             self._worked_out[key] = self._worked(basis, functions, test)
         return self._worked_out[key]

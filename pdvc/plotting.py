@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pdvc.deviations import BEAM
 from pdvc.measurement import Measurement
-from pdvc.points import DIRECTIONS, displacement, strain
+from pdvc.points import displacement, strain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,20 +20,21 @@ COLOURS = {"across": "#0072b2", "vertical": "#e69f00", "along": "#009e73"}
 def plot(measurement: Measurement) -> Figure:
     """Draw the motion of mid-height against the step, a map of the strain, and its profile at the last step.
 
-    Bands are two standard deviations wide on either side; where the verdict is not `trusted`, the title says so.
+    Bands are two standard deviations wide on either side; the title tells the verdict, and its doubts.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 3.8), layout="constrained")
     motion, picture, profile = figure.subplots(1, 3)
     heights = measurement.motion.basis.height_mm
-    middle = displacement(measurement, [[0.0, 0.0, float(heights[len(heights) // 2])]]).isel(point=0)
-    for name in DIRECTIONS:
+    height = float((heights[0] + heights[-1]) / 2)
+    middle = displacement(measurement, [[0.0, 0.0, height]]).isel(point=0)
+    for name in BEAM:
         one = middle.sel(direction=name)
         line, spread = one["turned"].values * 1e3, 2e3 * one["deviation"].values
         motion.plot(middle["step"], line, color=COLOURS[name], label=name)
         motion.fill_between(middle["step"], line - spread, line + spread, color=COLOURS[name], alpha=0.25, linewidth=0)
-    motion.set(xlabel="step", ylabel="displacement (µm)", title=f"z = {heights[len(heights) // 2]:.2f} mm")
+    motion.set(xlabel="step", ylabel="displacement (µm)", title=f"z = {height:.2f} mm")
     motion.legend(frameon=False)
     if len(heights) > 1:
         found = strain(measurement)

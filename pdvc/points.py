@@ -8,13 +8,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from pdvc.deviations import beam_frame
+from pdvc.deviations import BEAM, beam_frame
 from pdvc.measurement import Measurement
 
 Floats = NDArray[np.float64]
-
-DIRECTIONS = ["across", "vertical", "along"]
-"""Of the beam: `pdvc.deviations.beam_frame`."""
 
 
 def displacement(measurement: Measurement, points_mm: ArrayLike, steps: Sequence[int] | None = None) -> xr.Dataset:
@@ -41,7 +38,7 @@ def displacement(measurement: Measurement, points_mm: ArrayLike, steps: Sequence
         },
         coords={
             "component": ["x", "y", "z"],
-            "direction": DIRECTIONS,
+            "direction": list(BEAM),
             **{axis: ("point", points[:, k], unit) for k, axis in enumerate("xyz")},
             **_of_steps(measurement, chosen),
         },

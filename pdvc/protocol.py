@@ -25,7 +25,7 @@ from pdvc.experiment import Experiment
 from pdvc.history import settled
 from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Stage
 from pdvc.noise import known_from_residual, propagate
-from pdvc.options import DEFAULT, MeasureOptions, ResolvedStage, StageOptions
+from pdvc.options import DEFAULT, MeasureOptions, ResolvedStage, check_discarded
 from pdvc.preparation import Prepared, noise_of, prepare, snr_of
 from pdvc.progress import Progress, silent
 from pdvc.result_checks import check_finite, doubts_of_result
@@ -36,8 +36,6 @@ from pdvc.uncertainty import posterior
 from pdvc.verdict import Stop, Verdict, explained_by
 from pdvc.volume import Volume
 
-__all__ = ["MeasureOptions", "StageOptions", "measure"]
-
 Floats = NDArray[np.float64]
 
 
@@ -46,9 +44,10 @@ def measure(
 ) -> Measurement:
     """Measure the motion of the sample in an experiment.
 
-    Raises ValueError, in one line, where the data cannot be used. `work` is a folder for intermediate results; they
-    are used again only with the same experiment and options.
+    Raises ValueError, in one line, where the data cannot be used, or what is found is not finite. `work` is a folder
+    for intermediate results; they are used again only with the same experiment and options.
     """
+    check_discarded(options, experiment.geometry)
     compiling = time.perf_counter()
     compile_kernels(progress=progress)
     compiling = time.perf_counter() - compiling
@@ -79,13 +78,14 @@ def _measured(
     fine = prepared[1]
     solving = time.perf_counter()
     solver = _Protocol(setup, prepared, progress)
-    start = solver.run("rigid", rigid, setup.options.rigid, np.zeros((len(time_functions), *rigid.shape)))
+    still = np.zeros((len(time_functions), *rigid.shape))
+    start = solver.run("rigid", rigid, setup.options.rigid, still, to_noise=False)
     start = sections.reproduced(start, rigid)
     standing = np.zeros((len(experiment.test), *sections.shape))
     initial = residuals(fine.images, sections, standing, progress=progress, task="initial residual")
     moved = np.einsum("ft,fjk->tjk", time_functions, start)
     after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
-    coefficients = solver.run("deformation", sections, setup.options.deformation, start)
+    coefficients = solver.run("deformation", sections, setup.options.deformation, start, to_noise=True)
     equations = solver.equations_at(sections, coefficients)
     amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
     propagating = time.perf_counter()
@@ -174,13 +174,15 @@ class _Protocol:
         self._progress = progress
         self._last: tuple[Floats, Equations] | None = None
 
-    def run(self, name: str, basis: SectionBasis, stages: tuple[ResolvedStage, ...], start: Floats) -> Floats:
+    def run(
+        self, name: str, basis: SectionBasis, stages: tuple[ResolvedStage, ...], start: Floats, *, to_noise: bool
+    ) -> Floats:
         """Solve the stages in turn from a start (function, section, motion), voxels; return where they end."""
         for stage in stages:
             kept = self._setup.store.arrays(
                 "stage",
                 (name, self._setup.options, stage, basis, self._time_functions, start),
-                lambda stage=stage, start=start: _packed(self._solved(name, basis, stage, start)),  # type: ignore[misc]
+                lambda stage=stage, start=start: _packed(self._solved(name, basis, stage, start, to_noise)),  # type: ignore[misc]
             )
             self.stages.append(
                 Stage(
@@ -206,7 +208,7 @@ class _Protocol:
         amplitude = np.einsum("ft,fjk->tjk", self._time_functions, coefficients)
         return linearise(self._prepared[1].images, basis, amplitude, progress=self._progress, task="last pass")
 
-    def _solved(self, name: str, basis: SectionBasis, stage: ResolvedStage, start: Floats) -> Solution:
+    def _solved(self, name: str, basis: SectionBasis, stage: ResolvedStage, start: Floats, to_noise: bool) -> Solution:
         prepared, passes = self._prepared[stage.scale], 0
 
         def at(amplitude: Floats) -> Equations:
@@ -222,7 +224,7 @@ class _Protocol:
                 start=start,
                 prior=self._setup.prior(basis),
                 # as long as the sample only moves as a whole, what is left is not noise
-                noise_rms=prepared.noise_rms if name == "deformation" else None,
+                noise_rms=prepared.noise_rms if to_noise else None,
             )
         )
         self._last = (solution.coefficients, solution.equations)

@@ -32,6 +32,17 @@ class SectionPattern:
     shift: Row = (0, 0, 0)
     """t, without unit."""
 
+    def __post_init__(self) -> None:
+        gradient, shift = np.array(self.gradient, dtype=float), np.array(self.shift, dtype=float)
+        finite = gradient.shape == (3, 3) and shift.shape == (3,) and np.isfinite([*gradient.ravel(), *shift]).all()
+        if not self.name or not finite:
+            raise ValueError(
+                f"section motion {self.name!r}: expected a name, 3 x 3 numbers as gradient and 3 as shift, got "
+                f"{self.gradient} and {self.shift}"
+            )
+        object.__setattr__(self, "gradient", tuple(tuple(row) for row in gradient.tolist()))
+        object.__setattr__(self, "shift", tuple(shift.tolist()))
+
     @classmethod
     def of(cls, name: str, pattern: ArrayLike) -> SectionPattern:
         """Return the motion with a pattern [G | t] (3, 4)."""
@@ -78,7 +89,9 @@ def motions_named(names: Iterable[str]) -> tuple[SectionPattern, ...]:
     wanted = tuple(names)
     unknown = [name for name in wanted if name not in _OFFERED]
     if unknown or not wanted:
-        raise ValueError(f"section motions: expected some of {sorted(_OFFERED)}, got {wanted}")
+        raise ValueError(
+            f"section motions: expected some of {sorted(_OFFERED)}, or what an installed plug-in offers, got {wanted}"
+        )
     return tuple(_OFFERED[name] for name in wanted)
 
 

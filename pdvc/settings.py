@@ -84,6 +84,8 @@ class Choice(Settings):
             cls._kinds = {}
             return
         kind = cls.model_fields["kind"].default
+        if not isinstance(kind, str):  # what several kinds have in common, and no kind itself
+            return
         known = cls._kinds.setdefault(kind, cls)
         # the same one again is a notebook's cell, or a module, that was run twice
         if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
@@ -126,17 +128,22 @@ class Choice(Settings):
             context = {"discriminator": "'kind'", "tag": name, "expected_tags": expected}
             raise PydanticKnownError("union_tag_invalid", context)
         # strict validation takes a list for a tuple only from JSON
-        return kind.model_validate_json(json.dumps(value))  # type: ignore[return-value]
+        return kind.model_validate_json(json.dumps(value, default=str))  # type: ignore[return-value]
 
 
 @cache
 def load_plugins() -> None:
     """Import what installed packages announce as the entry points `pdvc_bench.plugins`: modules with further kinds.
 
-    Done only where a name is asked for that nothing loaded so far offers.
+    Done only where a name is asked for that nothing loaded so far offers. Raises SettingsError where one cannot be
+    loaded.
     """
     for entry in entry_points(group=PLUGINS):
-        entry.load()
+        try:
+            entry.load()
+        except Exception as error:  # a package of somebody else may fail in any way
+            owner = entry.dist.name if entry.dist is not None else "an unknown package"
+            raise SettingsError(f"plug-in {entry.value} of {owner}: cannot be loaded: {error}") from error
 
 
 def read_toml(path: Path) -> dict[str, Any]:

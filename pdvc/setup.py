@@ -14,7 +14,7 @@ from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
 from pdvc.history import time_basis
 from pdvc.measurement import Recording
-from pdvc.options import MeasureOptions, ResolvedOptions, check_discarded, motions_of, resolved
+from pdvc.options import MeasureOptions, ResolvedOptions, check_discarded, resolved
 from pdvc.prior import Prior
 from pdvc.progress import Progress, silent
 from pdvc.radiographs import IDENTITY, Calibration, binned, calibrate, grey_levels
@@ -153,7 +153,7 @@ def _bases(
     geometry: ConeBeam, window: tuple[int, int, int, int], hull: Hull, options: MeasureOptions
 ) -> tuple[SectionBasis, SectionBasis]:
     """Return the rigid basis, one section with the rigid motions that the sections can follow, and the sections."""
-    sections = section_basis(geometry, window, hull, options.sections, motions_of(options.section_motions))
+    sections = section_basis(geometry, window, hull, options.sections, options.motions)
     middle = np.array([(sections.height_mm[0] + sections.height_mm[-1]) / 2])
     single = {
         motion: SectionBasis(height_mm=middle, radius_mm=sections.radius_mm, motions=(motion,)) for motion in RIGID

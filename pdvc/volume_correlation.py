@@ -40,7 +40,7 @@ from pdvc.equations import Equations
 from pdvc.experiment import Experiment, InterruptedScan
 from pdvc.history import Steps, time_basis
 from pdvc.measurement import MeasuredMotion, Measurement, Provenance, Stage, unfitted
-from pdvc.options import MeasureOptions, coarse_scale
+from pdvc.options import MeasureOptions, check_discarded, coarse_scale
 from pdvc.preparation import reference_volume, scan_volume
 from pdvc.prior import LEAST_RMS, Prior
 from pdvc.progress import Progress, silent
@@ -54,8 +54,6 @@ from pdvc.uncertainty import UNSEEN, sandwich
 from pdvc.verdict import Stop, Verdict
 from pdvc.volume import Volume, halved, smoothed
 from pdvc.volume_equations import VolumeComparison, VolumePair, compare, used_voxels
-
-__all__ = ["MeasureOptions", "correlate"]
 
 Floats = NDArray[np.float64]
 
@@ -84,6 +82,7 @@ def correlate(
             "interrupted scans: expected at least one [[interrupted]] entry in experiment.toml, found none: volume "
             "correlation compares full scans"
         )
+    check_discarded(options, experiment.geometry)
     compiling = time.perf_counter()
     compile_kernels(progress=progress)
     compile_comparison()
@@ -102,7 +101,7 @@ def correlate(
     found = {
         scan.step: setup.store.arrays(
             "correlation",
-            (scan.step, setup.options),
+            (scan.step, setup.options, setup.sections),
             lambda scan=scan: _correlated(setup, references, scan, progress),  # type: ignore[misc]
         )
         for scan in experiment.interrupted

@@ -61,7 +61,7 @@ class Scene(NamedTuple):
     """Voxel of the volume, mm: F is given per mm."""
 
 
-class Steps(NamedTuple):
+class Moved(NamedTuple):
     """What differs from step to step."""
 
     box: Floats

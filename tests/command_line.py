@@ -23,11 +23,13 @@ def only_line(result):
     return lines[0]
 
 
-def install(folder: Path, entry_points: dict[str, str], module: str = "", name: str = "toy") -> None:
+def install(
+    folder: Path, entry_points: dict[str, str], module: str = "", name: str = "toy", group: str = GROUP
+) -> None:
     """Lay out a package as pip installs it: a module, its metadata, and its entry points (name, value)."""
     info = folder / f"{name}-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
     lines = [f"{key} = {value}\n" for key, value in entry_points.items()]
-    (info / "entry_points.txt").write_text(f"[{GROUP}]\n{''.join(lines)}")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{''.join(lines)}")
     (folder / f"{name}.py").write_text(module)

@@ -23,7 +23,7 @@ def test_import_contracts_hold():
 def test_the_simulator_may_import_these_of_pdvc_and_nothing_else():
     graph = grimp.build_graph("pdvc", "simulator", cache_dir=None)
     records = {"pdvc", "pdvc.experiment", "pdvc.geometry", "pdvc.progress", "pdvc.settings"}
-    files = {"pdvc.digest", "pdvc.lock", "pdvc.stacks", "pdvc.surroundings", "pdvc.whole"}
+    files = {"pdvc.digest", "pdvc.lock", "pdvc.stacks", "pdvc.whole"}
     reached = {
         module
         for each in graph.find_descendants("simulator") | {"simulator"}

@@ -12,16 +12,18 @@ from pdvc.options import MeasureOptions, StageOptions, check_discarded, paper_op
 from pdvc.pgd import Pgd
 from pdvc.sections import RIGID, names_of
 from pdvc.settings import SettingsError
+from pdvc.volume import Grid, hull_of
+from pdvc.window import used_window
 
 
 def scanner(rows, columns):
     return ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.1, rows=rows, columns=columns)
 
 
-def resolved_for(options, rows, columns):
-    """Return the options as they are for a detector, with 3 rows and 2 columns left out."""
+def resolved_for(options, rows, columns, discarded=(3, 2)):
+    """Return the options as they are for a detector, with some rows and columns left out."""
     test = SimpleNamespace(force_N=np.full(20, 250.0))
-    return resolved(options, SimpleNamespace(geometry=scanner(rows, columns), test=test), 3, 2)
+    return resolved(options, SimpleNamespace(geometry=scanner(rows, columns), test=test), *discarded)
 
 
 def scales(stages):
@@ -50,12 +52,19 @@ def test_the_coarse_scale_leaves_a_hundred_rows(rows, coarse):
 
 def test_what_is_given_stays():
     options = MeasureOptions(
-        discard_rows=3,
-        discard_columns=2,
+        discard_rows=0,
+        discard_columns=7,
         rigid=(StageOptions(scale=3),),
         deformation=(StageOptions(solver=Pgd(most_modes=1)),),
     )
-    assert resolved_for(options, 954, 432).model_dump() == options.model_dump()
+    assert resolved_for(options, 954, 432, (0, 7)).model_dump() == options.model_dump()
+
+
+def test_no_row_left_out_is_not_a_row_left_open():
+    grid = Grid(shape=(40, 20, 20), voxel_mm=0.1, origin_mm=(-0.95, -0.95, -1.95))
+    hull = hull_of(np.ones(grid.shape, dtype=bool), grid, 4)
+    assert used_window(scanner(120, 60), hull, 0, 0) == (0, 120, 0, 60)
+    assert used_window(scanner(120, 60), hull, None, 0)[0] > 0
 
 
 def test_resolving_twice_changes_nothing_more():

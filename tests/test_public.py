@@ -6,6 +6,7 @@ import inspect
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,14 +15,19 @@ import numpy as np
 import pytest
 
 import pdvc
+from pdvc.gauss_newton import GaussNewton
 from pdvc.history import TimeFunction, time_basis
 from pdvc.options import MeasureOptions, StageOptions
-from pdvc.plan import PlannedTest
+from pdvc.prior import Prior
 from pdvc.sections import SectionBasis
-from pdvc.settings import SettingsError
+from pdvc.settings import PLUGINS, SettingsError, load_plugins
+from pdvc.solution import Problem
 from simulator.scanner import simulate
 from tests import synthetic_records as records
+from tests.command_line import install, pdvc_bench
+from tests.small_case import SECTIONS, STEPS, lineariser, radiographs
 from tests.tiny_scenarios import TINY
+from validation.plan.designs import design_of_experiment, planned_like
 from validation.testing.small_cases import SmallExperiment, small_scenario
 
 ROOT = Path(__file__).parent.parent
@@ -127,6 +133,20 @@ def test_a_section_motion_is_added_by_the_page_alone(added, tmp_path):
     # the sample does not shear, and no fit would say so exactly
     z = measured.motion.amplitude[..., -1] / measured.motion.amplitude_std[..., -1]
     assert 0 < np.sqrt((z**2).mean()) < 4
+    # a bar that does shear, by pdvc's own projector: to the sign, and to a twentieth
+    sheared = replace(SECTIONS, motions=(*SECTIONS.motions, shear))
+    amplitude = np.zeros((STEPS, *sheared.shape))
+    amplitude[..., -1] = 0.4
+    found = GaussNewton(most_passes=8, least_change_voxel=1e-5).solve(
+        Problem(
+            linearise=lineariser(radiographs(sheared, amplitude), sheared),
+            time_functions=np.ones((1, STEPS)),
+            start=np.zeros((1, *sheared.shape)),
+            prior=Prior(deviation_voxel=np.full(sheared.shape, 30.0)),
+            noise_rms=None,
+        )
+    )
+    np.testing.assert_allclose(found.coefficients[0, 1:-1, -1], 0.4, atol=0.02)
 
 
 def test_a_solver_is_added_by_the_page_alone(added, tmp_path):
@@ -161,6 +181,27 @@ def test_an_unknown_kind_is_answered_with_the_known_ones():
         MeasureOptions.parse({"deformation": [{"solver": {"kind": "pgd", "most": 3}}]}, where="options")
     with pytest.raises(SettingsError, match=r"solver\.most_modes: unknown key"):
         MeasureOptions.parse({"deformation": [{"solver": {"kind": "gauss-newton", "most_modes": 3}}]}, where="options")
+
+
+def test_what_several_kinds_have_in_common_is_no_kind():
+    class Delayed(TimeFunction):
+        """Anything that begins later."""
+
+        start: int = 0
+
+    assert Delayed not in TimeFunction.kinds()
+    with pytest.raises(SettingsError, match=r"time\.0: unknown kind 'nothing', expected 'angle'"):
+        MeasureOptions.parse({"time": [{"kind": "nothing"}]}, where="options")
+
+
+def test_a_plug_in_that_cannot_be_loaded_is_named(tmp_path, monkeypatch):
+    install(tmp_path, {"mine": "broken_plug_in"}, "import nothing_like_this", name="broken_plug_in", group=PLUGINS)
+    monkeypatch.syspath_prepend(tmp_path)
+    load_plugins.cache_clear()
+    with pytest.raises(SettingsError, match="plug-in broken_plug_in of broken_plug_in: cannot be loaded: No module"):
+        MeasureOptions.parse({"time": [{"kind": "theirs"}]}, where="options")
+    monkeypatch.undo()
+    load_plugins.cache_clear()
 
 
 def test_a_kind_is_offered_by_one_record_only(added):
@@ -240,16 +281,40 @@ def test_sections_that_cannot_follow_a_rigid_motion_say_so_and_the_rigid_stage_l
     assert measured.fit.stages[0].spatial.shape[2] == 4
 
 
-def test_a_planned_test_needs_no_counts():
-    nothing = np.zeros(4)
-    test = PlannedTest(angle_rad=nothing, time_s=nothing, force_N=nothing, moved_mm=np.zeros((4, 3)))
-    assert len(test.recorded()) == 4
+@pytest.mark.parametrize(
+    "angle_deg",
+    [137.5 * np.arange(30), (200 + 7.0 * np.arange(30)) % 360, -7.2 * np.arange(30), np.zeros(30)],
+    ids=["golden", "modulo a turn", "clockwise", "standing still"],
+)
+def test_the_own_design_of_a_laboratory_is_what_it_planned(angle_deg):
+    """Whatever the angles are: only other designs change them, along the way that was planned."""
+    angle, steps = np.deg2rad(angle_deg), len(angle_deg)
+    series = SimpleNamespace(angle_rad=angle, time_s=2.0 * np.arange(steps), force_N=np.linspace(250, 700, steps))
+    test = _Sized(series, steps)
+    experiment = SimpleNamespace(test=test, frames=2, flats=np.zeros(3))
+    own = design_of_experiment(experiment, MeasureOptions())
+    same = planned_like(experiment, own, own)
+    assert len(same.recorded()) == steps
+    np.testing.assert_allclose(np.exp(1j * same.angle_rad), np.exp(1j * angle), atol=1e-9)
+    np.testing.assert_allclose(same.force_N, series.force_N)
+    denser = planned_like(experiment, replace(own, turns=2 * own.turns), own)
+    turned = np.unwrap(angle)[-1] - np.unwrap(angle)[0]
+    assert denser.angle_rad[-1] - denser.angle_rad[0] == pytest.approx(2 * turned)
+
+
+class _Sized(SimpleNamespace):
+    """A series with a length."""
+
+    def __init__(self, values, steps):
+        super().__init__(**vars(values))
+        self._steps = steps
+
+    def __len__(self):
+        return self._steps
 
 
 def test_a_laboratory_plans_from_its_reference_scan(tmp_path):
     """The folder of an experiment whose test is still to be made: its radiographs are not there."""
-    from tests.command_line import pdvc_bench
-
     (tmp_path / "tiny.toml").write_text(TINY)
     assert pdvc_bench("simulate", tmp_path / "tiny.toml", "-o", tmp_path / "experiment").exit_code == 0
     (tmp_path / "experiment" / "test" / "radiographs.tif").unlink()

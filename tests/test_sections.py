@@ -108,6 +108,10 @@ def test_a_motion_is_found_by_its_name_and_a_name_is_given_once():
     with pytest.raises(ValueError, match="'rotation_z': expected a name that is free"):
         offer_motion(replace(ROUND, name="rotation_z"))
     offer_motion(CONTRACTION)  # the same again changes nothing
+    assert SectionPattern(name="x", shift=np.array([1, 0, 0])) == SectionPattern(name="x", shift=(1.0, 0.0, 0.0))
+    for wrong in ({"gradient": np.full((3, 3), np.nan)}, {"shift": (1.0, 2.0)}, {"name": ""}):
+        with pytest.raises(ValueError, match=r"section motion '.*': expected a name, 3 x 3 numbers"):
+            SectionPattern(**{"name": "mine", **wrong})
     assert SectionPattern.of("round", ROUND.pattern()) == ROUND
 
 

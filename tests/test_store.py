@@ -15,14 +15,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdvc import sections
 from pdvc.digest import digest
 from pdvc.experiment import Experiment, InterruptedScan, Series
 from pdvc.geometry import ConeBeam
 from pdvc.history import TimeFunction
 from pdvc.options import MeasureOptions
 from pdvc.protocol import measure
+from pdvc.sections import SectionPattern
 from pdvc.settings import Settings
 from pdvc.store import Store, experiment_digest, reference_digest
+from validation.batch.trial import LeastError, Trial
 from validation.testing.small_cases import SmallExperiment, small_scenario
 
 GEOMETRY = ConeBeam(source_axis_mm=20, source_detector_mm=40, pixel_mm=0.1, rows=3, columns=4)
@@ -59,7 +62,9 @@ def experiment() -> Experiment:
 
 def every_options() -> MeasureOptions:
     """Return options in which every kind of time function occurs."""
-    return MeasureOptions(time=tuple(kind() for kind in TimeFunction.kinds()))
+    ours = [kind for kind in TimeFunction.kinds() if kind.__module__ == TimeFunction.__module__]
+    assert len(ours) == 7
+    return MeasureOptions(time=tuple(kind() for kind in ours))
 
 
 Path = tuple[str | int, ...]
@@ -264,3 +269,35 @@ def test_the_same_experiment_is_measured_from_what_was_kept(used_before):
     before = {path: path.stat().st_mtime_ns for path in work.iterdir()}
     measure(here, options, work=work)
     assert {path: path.stat().st_mtime_ns for path in work.iterdir()} == before
+
+
+def test_a_kind_of_somebody_s_own_counts_with_what_it_does():
+    """With its source and without, as where it was typed in; also what it is derived from."""
+
+    def made(body, name="Mine", base="TimeFunction"):
+        space = {"TimeFunction": TimeFunction, "np": np, "__name__": "typed_in"}
+        exec(
+            f"class {name}({base}):\n    kind: str = '{name}'\n    def functions(self, series):\n        {body}", space
+        )
+        TimeFunction._kinds.pop(name)
+        return space[name]
+
+    sine, cosine, wave = (
+        made(f"return {each}(series.angle_rad)[None]") for each in ("np.sin", "np.cos", "(lambda x: np.sin(2 * x))")
+    )
+    digests = {digest(each()) for each in (sine, cosine, wave)}
+    assert len(digests) == 3
+    assert digest(made("return np.sin(series.angle_rad)[None]")()) in digests
+
+
+def test_a_section_motion_counts_with_what_it_is_not_its_name_alone(monkeypatch):
+    shear = SectionPattern(name="counted", gradient=((0, 1, 0), (1, 0, 0), (0, 0, 0)))
+    other = replace(shear, gradient=((0, 1, 0), (0, 0, 0), (0, 0, 0)))
+    keys = []
+    for motion in (shear, other):
+        monkeypatch.setitem(sections._OFFERED, "counted", motion)
+        options = MeasureOptions(section_motions=("translation_x", "counted"))
+        small = small_scenario({})
+        run, bound = Trial(scenario=small, options=options, factors={}), LeastError(small, options)
+        keys.append((run.key, bound.name, digest(options, options.motions)))
+    assert all(one != two for one, two in zip(*keys, strict=True))

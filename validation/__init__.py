@@ -1,5 +1,5 @@
 """Scores of a measurement against its truth, figures, reports and the command line."""
 
-from pdvc.surroundings import check_namesakes
+from pdvc_bench import check_namesakes
 
 check_namesakes("pdvc", "simulator")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import re
 import time
+import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -138,7 +138,8 @@ def _say(console: Console, text: str) -> None:
 def used(measurement: Measurement) -> str:
     """Return in one line which part of the radiographs was used, and where loading begins."""
     top, bottom, left, right = measurement.recording.window
-    starts = re.findall(r"^start = (\d+)", measurement.provenance.options, re.MULTILINE)
+    parts = tomllib.loads(measurement.provenance.options).get("time", [])
+    starts = [str(part["start"]) for part in parts if part["kind"] == "ramp" and isinstance(part["start"], int)]
     onset = f"; loading begins after step {', '.join(dict.fromkeys(starts))}" if starts else ""
     return f"used: rows {top} to {bottom - 1}, columns {left} to {right - 1}{onset}"
 

@@ -31,7 +31,7 @@ from validation.report.page import write_report
 from validation.scoring.scores import Scores, score
 
 if TYPE_CHECKING:
-    from pdvc.protocol import MeasureOptions
+    from pdvc.options import MeasureOptions
     from simulator.scenario import Scenario
 
 
@@ -151,7 +151,7 @@ def _measure(
     job: Job, state: State, state_path: Path, experiment: Experiment, progress: Progress
 ) -> tuple[Measurement, bool]:
     """Measure unless that is done with the same options; returns the measurement and whether it was."""
-    wanted = digest(job.options, experiment_digest(experiment), experiment.title)
+    wanted = digest(job.options, job.options.motions, experiment_digest(experiment), experiment.title)
     if job.measurement.exists() and state.measurement == wanted:
         # one that was damaged since is made again
         with suppress(MeasurementError):

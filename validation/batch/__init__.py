@@ -1,5 +1,5 @@
 """Many runs on many processors, each kept on disk as soon as it is finished."""
 
-from pdvc.surroundings import check_extra
+from pdvc_bench import check_extra
 
 check_extra("many", "dask", "distributed", "pandas", "pyarrow")

@@ -75,6 +75,7 @@ class Trial:
             # a spectrum may be a file: its content counts, not its name
             clean_file(self.scenario, Stack("reference")),
             self.options,
+            self.options.motions,
             software("pdvc", "simulator", "validation"),
         )
 
@@ -172,7 +173,12 @@ class LeastError:
         key = digest(
             *(part.name for part in clean_parts(self.scenario)),
             self.scenario.detector,
-            self.options.model_dump_json(exclude=_HOW_TO_SOLVE),
+            {
+                name: getattr(self.options, name)
+                for name in type(self.options).model_fields
+                if name not in _HOW_TO_SOLVE
+            },
+            self.options.motions,
             software("pdvc", "simulator", "validation"),
         )
         return f"bounds/{key}.json"

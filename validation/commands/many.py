@@ -162,15 +162,14 @@ def plan(
     Example:  `pdvc-bench plan quick`
     """
     with answering() as progress:
+        from pdvc.experiment import DESCRIPTION, read_experiment
         from validation.job import write_text
         from validation.plan.designs import plan_experiment
         from validation.plan.tables import designs_csv, designs_table, weak_table
 
         read = read_options(options)
         folder = Path(scenario)
-        if folder.is_dir():
-            from pdvc.experiment import read_experiment
-
+        if (folder / DESCRIPTION).is_file():
             experiment = read_experiment(folder, planned=True)
             use_threads(threads)
             name, found = experiment.title or str(folder), plan_experiment(experiment, read, progress=progress)
@@ -185,8 +184,11 @@ def plan(
             write_text(out, designs_csv(found))
     from rich.console import Console
 
+    from validation.console import say_doubts
+
     console = Console()
     console.print(designs_table(found, name))
     console.print(weak_table(found))
+    say_doubts(console, found.doubts)
     if out is not None:
         tell(f"table: {out}")

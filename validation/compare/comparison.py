@@ -13,6 +13,7 @@ bit. Methods that do not look at interrupted scans are not handed any.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
 import time
@@ -20,8 +21,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-from pdvc.digest import digest, software
+from pdvc.digest import digest, software, source_of
 from pdvc.experiment import Experiment
 from pdvc.lock import held
 from pdvc.measurement import Measurement
@@ -128,11 +130,12 @@ def _costs(experiment: Experiment, looks_at: LooksAt) -> dict[str, Scalar]:
 
 def _source(method: Method) -> str:
     """Return the text of the file that holds a method: a method that is being worked on is run anew."""
-    try:
-        path = inspect.getsourcefile(inspect.unwrap(method.measure))
-    except TypeError:
-        path = None
-    return Path(path).read_text(encoding="utf-8") if path and Path(path).is_file() else ""
+    measure, given = method.measure, []
+    while isinstance(measure, functools.partial):
+        given.append(repr((measure.args, measure.keywords)))
+        measure = measure.func
+    function: Any = measure if inspect.isroutine(measure) else type(measure)
+    return "\n".join([source_of(function), *given])
 
 
 GAUGES = 14

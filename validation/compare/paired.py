@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +22,6 @@ from validation.batch.engine import ERRORS, Scalar
 from validation.scoring.bootstrap import Estimate, bootstrapped, mean, rms
 from validation.scoring.centre_line import TruePoints, centre_line
 from validation.scoring.scores import point_errors
-
-if TYPE_CHECKING:
-    pass
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

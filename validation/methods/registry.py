@@ -1,6 +1,6 @@
 """Methods: named ways from an experiment to a measurement, found through the entry points of installed packages.
 
-A package adds a method by an entry point of the group `pdvc_bench.methods`; the methods below are found in the same
+A package adds a method by an entry point of the group `pdvc_bench.methods`; our own methods are found in the same
 way. What an entry point names is a `Method`.
 """
 

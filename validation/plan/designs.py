@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.data_checks import doubts_of_reference, usable
 from pdvc.deviations import Knowledge, Quantities
 from pdvc.experiment import Experiment
 from pdvc.options import MeasureOptions
 from pdvc.plan import PlannedTest, Planner, WeakMotion, weakest
 from pdvc.progress import Progress, silent
+from pdvc.verdict import Doubt
 
 Floats = NDArray[np.float64]
 
@@ -52,10 +54,12 @@ class Expected:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The scenario's own design, others around it, and what would stay invisible in its own."""
+    """A test's own design, others around it, and what would stay invisible in its own."""
 
     own: Expected
     others: tuple[Expected, ...]
+    doubts: tuple[Doubt, ...] = ()
+    """What speaks against the reference scan; of a simulated one nothing does."""
     weak: tuple[WeakMotion, ...]
     """The weakest motions, the weakest first."""
 
@@ -91,20 +95,24 @@ def plan_experiment(
     """Return what is expected of a test like that of an experiment, from its real reference scan.
 
     The course of angle and force is the experiment's, made denser, longer or shorter; how far the sample will move is
-    not known, and taken as nothing. Raises ValueError where the description does not tell the noise.
+    not known, and taken as nothing. Raises ValueError where the description does not tell the noise, or the reference
+    scan cannot be used.
     """
+    alone = replace(experiment, test=experiment.reference, interrupted=())
+    doubts = doubts_of_reference(usable(alone, progress=progress), alone)
     planner = Planner(experiment, options, progress=progress)
     own = design_of_experiment(experiment, options)
 
     def test(design: Design) -> PlannedTest:
-        return planned_like(experiment, design)
+        return planned_like(experiment, design, own)
 
-    return compared(planner, own, designs, test, lambda _: planner.points_mm(), count, progress)
+    found = compared(planner, own, designs, test, lambda _: planner.points_mm(), count, progress)
+    return replace(found, doubts=doubts)
 
 
 def design_of_experiment(experiment: Experiment, options: MeasureOptions) -> Design:
     """Return the design of an experiment, by its recorded angles; a test of one step stands for a turn of one."""
-    angle = experiment.test.angle_rad
+    angle = np.unwrap(experiment.test.angle_rad)
     step = float(np.median(np.abs(np.diff(angle)))) if len(angle) > 1 else 2 * np.pi
     steps_per_turn = max(round(2 * np.pi / step), 1) if step > 0 else 1
     return Design(
@@ -116,14 +124,19 @@ def design_of_experiment(experiment: Experiment, options: MeasureOptions) -> Des
     )
 
 
-def planned_like(experiment: Experiment, design: Design) -> PlannedTest:
-    """Return a test as a design makes it, of the same duration and loading as an experiment's."""
+def planned_like(experiment: Experiment, design: Design, own: Design) -> PlannedTest:
+    """Return a test as a design makes it, of the same duration and loading as an experiment's.
+
+    With as many steps as the experiment's `own` design angles, times and forces are those recorded; with more or fewer
+    they are interpolated, and with more turns the angles run faster.
+    """
     test, steps = experiment.test, design.steps
     share = np.linspace(0, 1, steps)
     recorded = np.linspace(0, 1, len(test))
-    sense = -1.0 if test.angle_rad[-1] < test.angle_rad[0] else 1.0
+    angle = np.unwrap(test.angle_rad)
+    turned = np.interp(share, recorded, angle - angle[0]) * (design.turns / own.turns)
     return PlannedTest(
-        angle_rad=test.angle_rad[0] + sense * 2 * np.pi * np.arange(steps) / design.steps_per_turn,
+        angle_rad=angle[0] + turned,
         time_s=np.interp(share, recorded, test.time_s),
         force_N=np.interp(share, recorded, test.force_N),
         moved_mm=np.zeros((steps, 3)),

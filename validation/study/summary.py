@@ -16,7 +16,6 @@ bootstrapped: repetitions are drawn with replacement.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap
 
 from validation.batch.engine import ERRORS
+from validation.scoring.bootstrap import Estimate
 from validation.study.description import Study
 
 Floats = NDArray[np.float64]
@@ -35,15 +35,6 @@ PARTS = ("error", "bias", "random")
 LEAST_REPETITIONS = 3
 """Below, no interval is given."""
 RESAMPLES = 999
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with the ends of its 95 % interval; NaN where it is not known."""
-
-    value: float
-    low: float
-    high: float
 
 
 def summarise(study: Study, table: pd.DataFrame, folder: Path) -> pd.DataFrame:
@@ -90,11 +81,11 @@ def estimates(errors: Sequence[NDArray[np.floating]], seed: int = 0) -> dict[str
     One repetition alone cannot tell bias from random; fewer than `LEAST_REPETITIONS` give no interval.
     """
     if not errors:
-        return {part: Estimate(np.nan, np.nan, np.nan) for part in PARTS}
+        return {part: Estimate(value=np.nan) for part in PARTS}
     stacked = np.stack([np.ravel(each).astype(float) for each in errors])
     stacked = stacked[:, np.isfinite(stacked).all(axis=0)]
     if not stacked.shape[1]:
-        return {part: Estimate(np.nan, np.nan, np.nan) for part in PARTS}
+        return {part: Estimate(value=np.nan) for part in PARTS}
     products = stacked @ stacked.T / stacked.shape[1]
     found = {
         "error": _with_interval(products, _mean_square, _mean_square, seed),
@@ -135,7 +126,7 @@ def _with_interval(
     """
     value, count = float(square(products)), len(products)
     if count < LEAST_REPETITIONS:
-        return Estimate(np.sqrt(value), np.nan, np.nan)
+        return Estimate(value=float(np.sqrt(value)))
 
     def resampled(drawn: NDArray[np.intp], axis: int) -> Floats:
         chosen = np.moveaxis(drawn, axis, -1)
@@ -151,7 +142,7 @@ def _with_interval(
         rng=np.random.default_rng(seed),
     )
     low, high = (float(np.sqrt(max(end + value - float(known(products)), 0))) for end in found.confidence_interval)
-    return Estimate(float(np.sqrt(value)), low, high)
+    return Estimate(value=float(np.sqrt(value)), low=low, high=high)
 
 
 def _read(path: Path) -> tuple[NDArray[np.float32], ...]:

@@ -1,7 +1,7 @@
 """What the packages of this distribution ask of the place where they run.
 
-They have plain names. A folder of the same name that Python finds first hides one of them, and what an extra would
-bring may be missing: both are said in one line.
+They have plain names. A folder or file of the same name that Python finds first hides one of them, and what an extra
+would bring may be missing: both are said in one line. This package has a name that no user's folder has.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ HOME = Path(__file__).resolve().parent.parent
 
 
 def check_namesakes(*packages: str) -> None:
-    """Raise ImportError where another folder or module hides one of our packages."""
+    """Raise ImportError where another folder or file hides one of our packages, or it is not there."""
     for name in packages:
         spec = find_spec(name)
-        places = [] if spec is None else list(spec.submodule_search_locations or [spec.origin or ""])
+        if spec is None:
+            raise ImportError(f"{name}: expected the package of pdvc-bench in {HOME}, found none: install it again")
+        places = list(spec.submodule_search_locations or [spec.origin or ""])
         if HOME / name not in [Path(place).resolve() for place in places]:
-            found = " and ".join(map(str, places)) or "nothing"
             raise ImportError(
-                f"{name}: expected the package of pdvc-bench in {HOME}, found {found}, which hides it: rename that, "
-                "or start Python elsewhere"
+                f"{name}: expected the package of pdvc-bench in {HOME}, found {' and '.join(places)}, which hides it: "
+                "rename that, or start Python elsewhere"
             )
 
 
