@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pdvc.sections import SectionBasis
 from pdvc.volume import Hull, Volume
-from pdvc.walk import BAND_ROWS, Moved, Scene, Sums, walk_bands
+from pdvc.walk import BAND_ROWS, Scene, Steps, Sums, walk_bands
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -166,7 +166,7 @@ def _walk(
         residual=np.empty(target.shape, dtype=np.float32),
         kept=np.zeros((*target.shape, size) if fields is not None else (steps, 0, 0, 0), dtype=np.float32),
     )
-    of_steps = Moved(box=boxes, rays=index_rays, maps=maps, target=target, weight=weight, low=low)
+    of_steps = Steps(box=boxes, rays=index_rays, maps=maps, target=target, weight=weight, low=low)
     walk_bands(scene, of_steps, sums, with_sensitivities)
     if fields is not None:
         first = low[:, np.arange(target.shape[1]) // BAND_ROWS]

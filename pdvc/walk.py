@@ -19,6 +19,8 @@ parallel and added in order, so that the result does not depend on the number of
 
 A kernel and all that it calls are in this one file: numba looks for changes in the file of the kernel that is called,
 and would otherwise take an old one from its cache.
+The names of the records that kernels take are kept in that cache: one that is renamed or leaves makes old caches
+unreadable, with an AttributeError, and has to take the file's name with it.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ class Scene(NamedTuple):
     """Voxel of the volume, mm: F is given per mm."""
 
 
-class Moved(NamedTuple):
+class Steps(NamedTuple):
     """What differs from step to step."""
 
     box: Floats
