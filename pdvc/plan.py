@@ -30,7 +30,7 @@ from pdvc.gauss_newton import hessian
 from pdvc.history import time_basis
 from pdvc.noise import Pile, product
 from pdvc.options import MeasureOptions
-from pdvc.preparation import noise_of, prepare
+from pdvc.preparation import prepare, stated_noise
 from pdvc.progress import Progress, silent
 from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import noise_overlap, smoothed
@@ -97,12 +97,7 @@ class Planner:
         self._setup = set_up(replace(experiment, test=experiment.reference), options, progress=progress)
         self._reference_rad = experiment.reference.angle_rad
         prepared = prepare(self._setup, 1, progress)
-        noise = noise_of(self._setup, prepared)
-        if noise is None:
-            raise ValueError(
-                "plan: expected photons_per_count and readout_noise_counts in [acquisition] of experiment.toml, "
-                "found none: what is expected depends on the noise"
-            )
+        noise = stated_noise(self._setup, prepared)
         self._noise = noise
         self._images = prepared.images
         self._corner = prepared.systematic.corner

@@ -235,6 +235,17 @@ def noise_of(setup: Setup, prepared: Prepared) -> Noise | None:
     return Noise(step=step, view=view, flat=flat, smooth_px=setup.options.smooth_px)
 
 
+def stated_noise(setup: Setup, prepared: Prepared) -> Noise:
+    """Return the noise of all images at scale 1; raises ValueError where the experiment's description tells none."""
+    noise = noise_of(setup, prepared)
+    if noise is None:
+        raise ValueError(
+            "noise: expected photons_per_count and readout_noise_counts in [acquisition] of experiment.toml, "
+            "found none"
+        )
+    return noise
+
+
 def _noise_left(scale: int, smooth_px: float) -> float:
     """Return what filters and binning leave of the variance of white noise, by their impulse response."""
     size = 16 * scale + 2 * int(4 * smooth_px + 1)

@@ -7,8 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import grimp
-
 from tests.mutants import TESTS
 
 ROOT = Path(__file__).parent.parent
@@ -18,20 +16,7 @@ def test_import_contracts_hold():
     command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command; lint_imports_command()"]
     result = subprocess.run([*command, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
-
-
-def test_the_simulator_may_import_these_of_pdvc_and_nothing_else():
-    graph = grimp.build_graph("pdvc", "simulator", cache_dir=None)
-    records = {"pdvc", "pdvc.experiment", "pdvc.geometry", "pdvc.progress", "pdvc.settings"}
-    files = {"pdvc.digest", "pdvc.lock", "pdvc.stacks", "pdvc.whole"}
-    reached = {
-        module
-        for each in graph.find_descendants("simulator") | {"simulator"}
-        for module in graph.find_upstream_modules(each)
-        if module.partition(".")[0] == "pdvc"
-    }
-    assert reached <= records | files
-    assert "pdvc.experiment" in reached  # the graph is not empty
+    assert "4 kept, 0 broken" in result.stdout
 
 
 def test_the_command_line_starts_without_loading_numerics():

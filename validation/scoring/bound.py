@@ -29,7 +29,7 @@ from pdvc.experiment import Experiment, read_experiment
 from pdvc.gauss_newton import hessian
 from pdvc.noise import separate
 from pdvc.options import MeasureOptions
-from pdvc.preparation import noise_of, prepare
+from pdvc.preparation import prepare, stated_noise
 from pdvc.prior import solved
 from pdvc.progress import Progress, silent
 from pdvc.sections import SectionBasis
@@ -79,8 +79,7 @@ def _bound(experiment: Experiment, truth: TruePoints, options: MeasureOptions, p
     setup = set_up(experiment, options, progress=progress)
     basis, time_functions = setup.sections, setup.time_functions()
     prepared = prepare(setup, 1, progress)
-    noise = noise_of(setup, prepared)
-    assert noise is not None, "a scenario tells its noise"
+    noise = stated_noise(setup, prepared)
     information = np.stack([1 / noise.step(t).variance for t in range(len(experiment.test))])
     images = replace(prepared.images, weight=np.where(prepared.images.weight > 0, information, 0).astype(np.float32))
     voxel_mm = experiment.geometry.voxel_mm
