@@ -12,7 +12,7 @@ from pdvc.gauss_newton import GaussNewton
 from pdvc.geometry import ConeBeam
 from pdvc.history import PAPER, Ramp, TimeFunction, settled
 from pdvc.pgd import Pgd
-from pdvc.sections import CONTRACTION, RIGID, SectionPattern, motions_named, names_of
+from pdvc.sections import CONTRACTION, RIGID, SectionPattern, motions_named, names_of, offered_motions
 from pdvc.settings import Settings, load_plugins
 from pdvc.solution import Solver
 
@@ -122,7 +122,12 @@ class MeasureOptions(Settings):
     @field_validator("section_motions")
     @classmethod
     def _known_motions(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        motions_of(names)  # raises if one is unknown
+        try:
+            motions_of(names)
+        except ValueError:
+            wrong = ", ".join(repr(name) for name in names if name not in offered_motions())
+            said = f", {wrong} is none of them" if wrong else ""
+            raise ValueError(f"some of {', '.join(offered_motions())}{said}") from None
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"every motion once, {', '.join(twice)} stands there twice")

@@ -84,6 +84,11 @@ def names_of(motions: Iterable[SectionPattern]) -> tuple[str, ...]:
     return tuple(motion.name for motion in motions)
 
 
+def offered_motions() -> tuple[str, ...]:
+    """Return the names of all motions that are offered."""
+    return tuple(_OFFERED)
+
+
 def motions_named(names: Iterable[str]) -> tuple[SectionPattern, ...]:
     """Return motions by their names; raises ValueError where one is not offered."""
     wanted = tuple(names)

@@ -20,6 +20,7 @@ from pdvc.progress import Progress, silent
 from pdvc.radiographs import IDENTITY, Calibration, binned, calibrate, grey_levels
 from pdvc.sections import RIGID, SectionBasis, SectionPattern
 from pdvc.store import Keep, Store
+from pdvc.verdict import listed
 from pdvc.volume import Hull
 from pdvc.window import height_mm, used_window
 
@@ -69,8 +70,19 @@ class Setup:
         )
 
     def time_functions(self) -> Floats:
-        """Return the orthonormal time functions (function, step) of the options."""
-        return time_basis(self.options.time, self.experiment.test)
+        """Return the orthonormal time functions (function, step) of the options.
+
+        Raises ValueError where they leave a step without any: nothing could be said about it.
+        """
+        functions = time_basis(self.options.time, self.experiment.test)
+        without = np.flatnonzero(~functions.any(axis=0))
+        if len(without):
+            raise ValueError(
+                f"time: expected functions of which one or more is not zero at each step, all are zero at step "
+                f"{listed(without.tolist())}: add a constant, kind = 'polynomial' of degree 0 (a list in an options "
+                "file stands in place of the default one)"
+            )
+        return functions
 
     def prior(self, basis: SectionBasis) -> Prior:
         """Return the prior of the options for a basis."""

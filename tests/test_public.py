@@ -72,8 +72,7 @@ def test_importing_the_package_loads_nothing_heavy():
 
 
 def test_the_walk_through_runs(tmp_path, monkeypatch, capsys):
-    small = small_scenario({})
-    simulate(small, tmp_path / "experiment")
+    simulate(small_scenario({"geometry.rows": 84}), tmp_path / "experiment")
     monkeypatch.chdir(tmp_path)
     session: dict[str, object] = {}
     for block in blocks("walkthrough.md"):

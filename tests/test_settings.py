@@ -102,7 +102,10 @@ def test_a_detector_before_the_axis_is_refused():
 
 
 def test_an_unknown_motion_is_named():
-    with pytest.raises(SettingsError, match=r"section_motions: .*'rotation_x'.* given \['rotation_w'\]"):
+    with pytest.raises(
+        SettingsError,
+        match=r"section_motions: expected some of .*rotation_x.*'rotation_w' is none",
+    ):
         MeasureOptions.parse({"section_motions": ["rotation_w"]}, where="options")
 
 

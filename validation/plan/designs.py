@@ -23,6 +23,8 @@ from pdvc.verdict import Doubt
 
 Floats = NDArray[np.float64]
 
+BEFORE_VOXEL, LAST_VOXEL = 4.0, 10.0
+"""How far a sample is taken to move before a test that is only planned, and during it, voxels; the paper's: more."""
 INVISIBLE_VOXEL = 0.5
 """A motion that is expected to be known no better than this, voxels rms, is called invisible."""
 
@@ -94,8 +96,10 @@ def plan_experiment(
 ) -> Plan:
     """Return what is expected of a test like that of an experiment, from its real reference scan.
 
-    The course of angle and force is the experiment's, made denser, longer or shorter; how far the sample will move is
-    not known, and taken as nothing. Raises ValueError where the description does not tell the noise, or the reference
+    The course of angle and force is the experiment's, made denser, longer or shorter. How far the sample will move is
+    not known: it is taken to have moved by `BEFORE_VOXEL` along each axis before the test, and to go on upwards by
+    `LAST_VOXEL`. What matters is that a pixel does not see what it saw in the reference scan, or the flats' noise
+    would cancel. Raises ValueError where the description does not tell the noise, or the reference
     scan cannot be used.
     """
     alone = replace(experiment, test=experiment.reference, interrupted=())
@@ -134,12 +138,13 @@ def planned_like(experiment: Experiment, design: Design, own: Design) -> Planned
     share = np.linspace(0, 1, steps)
     recorded = np.linspace(0, 1, len(test))
     angle = np.unwrap(test.angle_rad)
+    voxel_mm = experiment.geometry.voxel_mm
     turned = np.interp(share, recorded, angle - angle[0]) * (design.turns / own.turns)
     return PlannedTest(
         angle_rad=angle[0] + turned,
         time_s=np.interp(share, recorded, test.time_s),
         force_N=np.interp(share, recorded, test.force_N),
-        moved_mm=np.zeros((steps, 3)),
+        moved_mm=voxel_mm * (BEFORE_VOXEL + LAST_VOXEL * share[:, None] * np.array([0.0, 0.0, 1.0])),
         share=steps / len(test),
         sections=design.sections,
         frames=design.frames / experiment.frames,

@@ -6,10 +6,12 @@ import csv
 import io
 from dataclasses import asdict
 
+from rich.box import SIMPLE
 from rich.table import Table
 
 from validation.plan.designs import INVISIBLE_VOXEL, Expected, Plan
 
+HEADINGS = ("a turn", "turns", "steps", "frames", "flats", "sections")
 _QUANTITIES = ("across_beam", "vertical", "along_beam", "strain")
 
 
@@ -29,12 +31,14 @@ def designs_table(plan: Plan, name: str) -> Table:
     """Return the designs with their expected standard deviations; what differs from the first is bold."""
     table = Table(
         title=f"{name}: expected standard deviations",
-        caption="Noise and prior, not errors of the model. First line: the test as it is.",
+        caption="Across the beam, vertical and along it in voxels; noise and prior, not errors of the model. "
+        "First line: the test as it is.",
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
     )
-    for heading in ("a turn", "turns", "steps", "frames", "flats", "sections"):
-        table.add_column(heading, justify="right")
-    for heading in ("across the beam, voxel", "vertical, voxel", "along the beam, voxel", "strain"):
-        table.add_column(heading, justify="right")
+    # narrow enough for a terminal of 80 columns, and whole where it is piped
+    for heading in (*HEADINGS, "across", "vertical", "along", "strain"):
+        table.add_column(heading, justify="right", no_wrap=True, min_width=len(heading))
     for each in (plan.own, *plan.others):
         table.add_row(*_design_cells(each, plan.own), *_deviation_cells(each), end_section=each is plan.own)
     return table
@@ -67,10 +71,15 @@ def weak_table(plan: Plan) -> Table:
     """Return the weakest motions of the scenario's own design, and whether any is invisible."""
     count = len(plan.invisible)
     verdict = f"{count} known to no better than {INVISIBLE_VOXEL} voxel" if count else "none is invisible"
-    table = Table(title="Motions that it shows least", caption=f"Of independent motions: {verdict}.")
-    table.add_column("mostly made of")
-    for heading in ("across the beam, voxel", "vertical, voxel", "along the beam, voxel", "of the prior's variance"):
-        table.add_column(heading, justify="right")
+    table = Table(
+        title="Motions that it shows least",
+        caption=f"In voxels, and as a share of the prior's variance. Of independent motions: {verdict}.",
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
+    )
+    table.add_column("mostly made of", overflow="fold")
+    for heading in ("across", "vertical", "along", "of prior"):
+        table.add_column(heading, justify="right", no_wrap=True, min_width=len(heading))
     for each in plan.weak:
         across, vertical, along = each.deviation_voxel
         name = " and ".join(each.motions).replace("_", " ") or "many motions"
