@@ -290,7 +290,8 @@ def test_the_own_design_of_a_laboratory_is_what_it_planned(angle_deg):
     angle, steps = np.deg2rad(angle_deg), len(angle_deg)
     series = SimpleNamespace(angle_rad=angle, time_s=2.0 * np.arange(steps), force_N=np.linspace(250, 700, steps))
     test = _Sized(series, steps)
-    experiment = SimpleNamespace(test=test, frames=2, flats=np.zeros(3))
+    geometry = SimpleNamespace(voxel_mm=0.05)
+    experiment = SimpleNamespace(test=test, frames=2, flats=np.zeros(3), geometry=geometry)
     own = design_of_experiment(experiment, MeasureOptions())
     same = planned_like(experiment, own, own)
     assert len(same.recorded()) == steps
@@ -328,6 +329,11 @@ def test_a_laboratory_plans_from_its_reference_scan(tmp_path):
 
     real, known = own("real.csv"), own("simulated.csv")
     assert real["steps"] == known["steps"]
-    # the same reference scan, with noise and without; points of the hull for those of the specimen
-    assert real["std_across_beam"] == pytest.approx(known["std_across_beam"], rel=0.3)
-    assert real["std_vertical"] == pytest.approx(known["std_vertical"], rel=0.3)
+    # the same reference scan, with noise and without; points of the hull for those of the specimen, and another motion,
+    # on which depends how much of the flats' noise cancels
+    assert real["std_across_beam"] == pytest.approx(known["std_across_beam"], rel=0.5)
+    assert real["std_vertical"] == pytest.approx(known["std_vertical"], rel=0.5)
+    rows = [line.split(",") for line in (tmp_path / "real.csv").read_text().splitlines()]
+    flats, vertical = rows[0].index("flats"), rows[0].index("std_vertical")
+    most = max(rows[1:], key=lambda row: int(row[flats]))
+    assert float(most[vertical]) < 0.95 * real["std_vertical"]  # more flats help: they do not cancel
