@@ -329,8 +329,8 @@ def test_a_laboratory_plans_from_its_reference_scan(tmp_path):
 
     real, known = own("real.csv"), own("simulated.csv")
     assert real["steps"] == known["steps"]
-    # the same reference scan, with noise and without; points of the hull for those of the specimen, and another motion,
-    # on which depends how much of the flats' noise cancels
+    # the same reference scan, with noise and without; points of the hull for those of the specimen, and another
+    # motion, on which depends how much of the flats' noise cancels
     assert real["std_across_beam"] == pytest.approx(known["std_across_beam"], rel=0.5)
     assert real["std_vertical"] == pytest.approx(known["std_vertical"], rel=0.5)
     rows = [line.split(",") for line in (tmp_path / "real.csv").read_text().splitlines()]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pdvc.data_checks import doubts_of_reference, usable
 from pdvc.deviations import Knowledge, Quantities
 from pdvc.experiment import Experiment
+from pdvc.history import settled
 from pdvc.options import MeasureOptions
 from pdvc.plan import PlannedTest, Planner, WeakMotion, weakest
 from pdvc.progress import Progress, silent
@@ -104,6 +105,8 @@ def plan_experiment(
     """
     alone = replace(experiment, test=experiment.reference, interrupted=())
     doubts = doubts_of_reference(usable(alone, progress=progress), alone)
+    # where the load begins is the same in all designs; in forces that are interpolated noise would hide it
+    options = options.model_copy(update={"time": settled(options.time, experiment.test)})
     planner = Planner(experiment, options, progress=progress)
     own = design_of_experiment(experiment, options)
 

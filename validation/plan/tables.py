@@ -11,7 +11,7 @@ from rich.table import Table
 
 from validation.plan.designs import INVISIBLE_VOXEL, Expected, Plan
 
-HEADINGS = ("a turn", "turns", "steps", "frames", "flats", "sections")
+HEADINGS = ("a turn", "turns", "steps", "frames", "flats", "sect.")
 _QUANTITIES = ("across_beam", "vertical", "along_beam", "strain")
 
 
@@ -37,7 +37,7 @@ def designs_table(plan: Plan, name: str) -> Table:
         padding=(0, 1, 0, 0),
     )
     # narrow enough for a terminal of 80 columns, and whole where it is piped
-    for heading in (*HEADINGS, "across", "vertical", "along", "strain"):
+    for heading in (*HEADINGS, "across", "vertical", "along", " strain"):
         table.add_column(heading, justify="right", no_wrap=True, min_width=len(heading))
     for each in (plan.own, *plan.others):
         table.add_row(*_design_cells(each, plan.own), *_deviation_cells(each), end_section=each is plan.own)
