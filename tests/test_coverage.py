@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
 from scipy import stats
 
+from validation.console import honesty_table
 from validation.study.coverage import DIRECTIONS, coverage_table, honesty, verdict
 from validation.study.description import Study
 
@@ -78,6 +80,12 @@ def test_draws_that_differ_in_all_they_may_are_pooled():
     (noise,) = honesty(STUDY, table)
     assert (found.draws, found.covered, found.z_rms) == (DRAWS, noise.covered, noise.z_rms)
     assert len(honesty(study.model_copy(update={"pooled": False}), table)) == DRAWS
+    console = Console(width=80, record=True)
+    console.print(honesty_table(study, found))
+    told = console.export_text()
+    assert f"{DRAWS} draws" in told
+    (line,) = (line for line in told.splitlines() if line.startswith("vertical"))
+    assert f"{100 * found.covered[-3].found.value:.0f} (" in line
 
 
 def test_failed_runs_do_not_count():

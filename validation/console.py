@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from pdvc.measurement import Measurement
     from simulator.scenario import Scenario
+    from validation.study.coverage import Honesty
     from validation.study.description import Study
 
 INTERRUPTED = 130
@@ -225,6 +226,27 @@ def study_summary(study: Study, summary: pd.DataFrame) -> Table:
             *(f"{each:g}" if isinstance(each, float) else str(each) for each in which),
             str(int(row["runs"])),
             *(f"{bias:.2g}/{random:.2g}" for bias, random in parts),
+        )
+    return table
+
+
+def honesty_table(study: Study, found: Honesty) -> Table:
+    """Return how often the intervals of pooled draws hold, as a table of one screen."""
+    levels = dict.fromkeys(one.level for one in found.covered)
+    title = f"{study.name}: {found.draws} draws; in brackets 95 % binomial intervals, each draw as one trial"
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for heading in ("", "stated, rms", "z rms", *(f"{level} % cover" for level in levels)):
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    for direction in found.z_rms:
+        covered = [one for one in found.covered if one.direction == direction]
+        table.add_row(
+            direction.replace("_", " "),
+            f"{found.predicted[direction]:.2g}",
+            f"{found.z_rms[direction]:.2f}",
+            *(
+                f"{one.found.value:.0%} ({one.binomial[0]:.0%} to {one.binomial[1]:.0%})".replace("%", "")
+                for one in covered
+            ),
         )
     return table
 

@@ -125,9 +125,14 @@ def study(
             )
     from rich.console import Console
 
-    from validation.console import study_summary
+    from validation.console import honesty_table, study_summary
+    from validation.study.coverage import honesty
 
-    Console().print(study_summary(chosen, summary))
+    if chosen.pooled:
+        for found in honesty(chosen, table):
+            Console().print(honesty_table(chosen, found))
+    else:
+        Console().print(study_summary(chosen, summary))
     failed = int((table["status"] != "done").sum())
     if failed:
         tell(f"{failed} of {len(table)} runs failed: see the reasons in {page}, or {out / 'failed'}")
