@@ -236,7 +236,7 @@ class Wander(Moving):
     """rms of the slow part of the shift along each axis, mm"""
     tilt_deg: float = 0.01
     """the same of the rotation vector, degrees"""
-    steps: Annotated[float, Field(gt=0)] = 15.0
+    slow_steps: Annotated[float, Field(gt=0)] = 15.0
     """steps over which the slow part changes"""
     drift_mm: float = 0.01
     """rms of a steady drift along each axis, over the whole test, mm"""
@@ -249,7 +249,7 @@ class Wander(Moving):
         """Return a Gaussian process of squared-exponential covariance, zero at the first step, drift, and slips."""
         rng, count = np.random.default_rng(np.random.SeedSequence(self.draw)), len(drive.angle_rad)
         step = np.arange(count)
-        covariance = np.exp(-(((step[:, None] - step) / self.steps) ** 2) / 2) + 1e-9 * np.eye(count)
+        covariance = np.exp(-(((step[:, None] - step) / self.slow_steps) ** 2) / 2) + 1e-9 * np.eye(count)
         slow = np.linalg.cholesky(covariance) @ rng.normal(size=(count, 6))
         slow -= slow[0]
         drift = rng.normal(size=3) * (step / max(count - 1, 1))[:, None]

@@ -212,7 +212,7 @@ def test_wandering_has_the_size_and_the_slowness_that_are_asked_for():
     """Over many draws: the slow part's variance of a difference is 2 s^2 (1 - exp(-d^2 / 2 l^2))."""
     still = {"drift_mm": 0.0, "slips": 0, "tilt_deg": 0.0}
     draws = np.stack(
-        [Wander(draw=n, shift_mm=0.5, steps=10.0, **still).motion(DRIVE).translation_mm for n in range(300)]
+        [Wander(draw=n, shift_mm=0.5, slow_steps=10.0, **still).motion(DRIVE).translation_mm for n in range(300)]
     )
     for lag in (1, 5, 60):
         found = ((draws[:, lag:] - draws[:, :-lag]) ** 2).mean()

@@ -17,7 +17,7 @@ from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import linalg
 
@@ -151,6 +151,8 @@ def test_rows_stored_beyond_the_used_window_do_not_matter(small, top, bottom, mo
     for found in (whole, cut):
         # a roll of one degree shortens heights by 1.5e-4 of them
         np.testing.assert_allclose(found.motion.basis.height_mm[[0, -1]], heights, atol=2e-4)
+    # where rays leave the volume, which is as high as what is stored, more of it tells more
+    assume(not {"cut-ends"} & {*whole.verdict.names, *cut.verdict.names})
     assert in_deviations(whole, cut) < 1
 
 
