@@ -4,18 +4,19 @@ No load step is needed: at rest, a step at angle theta shows what the reference 
 says what the step tells about the sections, and Q(theta) = S^T W V_g W S what its noise does. A test has
 
     H = sum_t sigma(t) sigma(t)^T (x) B(theta_t)
-    V = [ sum_t sigma(t) sigma(t)^T (x) Q(theta_t) + sum_v s_v s_v^T (x) Q(theta_v) + sum_p v_phi z z^T / m ] / k
+    V = [ sum_t sigma(t) sigma(t)^T (x) Q(theta_t) + sum_ab s_a s_b^T (x) Q(a, b) + sum_p v_phi z z^T / m ] / k
 
-with k the frames averaged and m the flats, each over those of the reference scan; s_v the sum of sigma over the steps
-that look along the reference view v, whose noise is as large as the steps' and returns with each turn; v_phi(p) the
-relative variance of the mean flat and z(p) its effect (`pdvc.noise`). The flats' noise cancels where a pixel is
-compared with itself, so that z depends on how far the sample moves: the mean motion that is expected at each step is
-taken, to whole pixels. What is expected are the deviations of `pdvc.uncertainty`, which hold noise and prior, not what
-the model cannot follow.
+with k the frames averaged and m the flats, each over those of the reference scan; s_a the sum of sigma over the steps
+at an angle a, and Q(a, b) = S_a^T W V_g W S_b over the pairs of angles whose nearest reference view is the same: its
+noise is as large as the steps' and returns with each turn; v_phi(p) the relative variance of the mean flat and z(p)
+its effect (`pdvc.noise`). The flats' noise cancels where a pixel is compared with itself, so that z depends on how far
+the sample moves: the mean motion that is expected at each step is taken, to whole pixels. What is expected are the
+deviations of `pdvc.uncertainty`, which hold noise and prior, not what the model cannot follow.
 """
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -159,15 +160,28 @@ class Planner:
         matrix = linearise(images, basis, still, progress=self._progress, task=task).matrix
         was = self._places(test)
         pile, noise = Pile(self._noise.flat.shape, functions, basis.shape[1]), np.empty_like(matrix)
+        # all steps at one angle have the noise of its view in common, and so have angles with the same view
+        shared = np.stack([functions[:, turn == k].sum(axis=1) for k in range(len(first))], axis=1)
+        alike: dict[int, list[tuple[int, Sensitivities]]] = defaultdict(list)
+        left, between = Counter(views.tolist()), np.zeros((len(functions), matrix.shape[1]) * 2)
         for k, field in enumerate(self._fields(images, basis)):
-            step = self._noise.step(int(views[k]))
+            view = int(views[k])
+            step = self._noise.step(view)
             noise[k] = product(field, field, step.variance, matrix.shape[1])
+            for other, seen in alike[view]:
+                joint = product(field, seen, step.variance, matrix.shape[1])
+                both = np.einsum("f,nm,g->fngm", shared[:, k], joint, shared[:, other])
+                between += both + both.transpose(2, 3, 0, 1)
+            left[view] -= 1
+            if left[view]:
+                alike[view].append((k, field))
+            else:
+                del alike[view]
             for t in np.flatnonzero(turn == k):
                 pile.add(int(t), field, -step.slope, self._corner)
                 pile.add(int(t), field, step.slope, was[t])
-        met, of_view, group = np.unique(views[turn], return_index=True, return_inverse=True)
-        shared = np.stack([functions[:, group == v].sum(axis=1) for v in range(len(met))], axis=1)
-        covariance = hessian(noise[turn], functions) + hessian(noise[turn][of_view], shared)
+        of_steps, of_views = hessian(noise[turn], functions), hessian(noise, shared)
+        covariance = of_steps + of_views + between.reshape(of_views.shape)
         return hessian(matrix[turn], functions), covariance, pile.covariance(self._noise.flat, matrix.shape[1])
 
     def _nearest(self, angle_rad: Floats) -> NDArray[np.intp]:
