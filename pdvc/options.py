@@ -156,7 +156,6 @@ def resolved(
     options: MeasureOptions, experiment: Experiment, discard_rows: int, discard_columns: int
 ) -> ResolvedOptions:
     """Return the options of an experiment, with what they leave open filled in: stages, onsets, and the window."""
-    given = {name: getattr(options, name) for name in MeasureOptions.model_fields}
     found = {
         "discard_rows": discard_rows,
         "discard_columns": discard_columns,
@@ -164,7 +163,7 @@ def resolved(
         "rigid": tuple(stage.at(experiment.geometry) for stage in options.rigid),
         "deformation": tuple(stage.at(experiment.geometry) for stage in options.deformation),
     }
-    return ResolvedOptions(**{**given, **found})
+    return ResolvedOptions(**{**dict(options), **found})
 
 
 def check_discarded(options: MeasureOptions, geometry: ConeBeam) -> None:

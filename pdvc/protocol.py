@@ -77,7 +77,7 @@ def _measured(
     prepared = {scale: prepare(setup, scale, progress) for scale in setup.options.scales}
     fine = prepared[1]
     solving = time.perf_counter()
-    solver = _Protocol(setup, prepared, progress)
+    solver = _Protocol(setup, prepared, time_functions, progress)
     still = np.zeros((len(time_functions), *rigid.shape))
     start = solver.run("rigid", rigid, setup.options.rigid, still, to_noise=False)
     start = sections.reproduced(start, rigid)
@@ -166,11 +166,13 @@ def _on_the_axis(
 class _Protocol:
     """The stages of a measurement, one after the other: what each found, and the last equations."""
 
-    def __init__(self, setup: Setup, prepared: Mapping[int, Prepared], progress: Progress) -> None:
+    def __init__(
+        self, setup: Setup, prepared: Mapping[int, Prepared], time_functions: Floats, progress: Progress
+    ) -> None:
         self.stages: list[Stage] = []
         self._setup = setup
         self._prepared = prepared
-        self._time_functions = setup.time_functions()
+        self._time_functions = time_functions
         self._progress = progress
         self._last: tuple[Floats, Equations] | None = None
 

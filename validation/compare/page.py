@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import jinja2
 import pyarrow as pa
 from matplotlib.figure import Figure
 from pyarrow import csv, parquet
@@ -31,6 +30,7 @@ from validation.compare.tables import (
     step_rows,
 )
 from validation.methods.registry import Method
+from validation.report.template import template
 from validation.scoring.bootstrap import LEAST_REPETITIONS
 
 PAGE = "comparison.html"
@@ -196,15 +196,8 @@ def _picture(path: Path, caption: str, figure: Figure) -> Picture:
 
 
 def _page(methods: Sequence[Method], chapters: Sequence[Chapter], summary: Summary, where: str) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("validation.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     repetitions = max((each.done + each.failed for each in summary.methods), default=0)
-    return environment.get_template("comparison.html").render(
+    return template("comparison.html").render(
         methods=methods,
         chapters=chapters,
         repetitions=repetitions,

@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import jinja2
 import numpy as np
 
 from pdvc.experiment import Experiment
@@ -22,6 +21,7 @@ from validation.report.sentences import (
     residual_sentences,
     trust_table,
 )
+from validation.report.template import template
 from validation.scoring.centre_line import TruePoints, centre_line, nan_mean
 from validation.scoring.interval_calibration import ONSET_STEPS
 from validation.scoring.noise_floor import LEAST_STEPS, NoiseFloor, noise_floor
@@ -75,14 +75,7 @@ def _page(
     measurement: Measurement, truth: TruePoints | None, scores: Scores | None, shown: list[dict[str, str]]
 ) -> str:
     floor = noise_floor(measurement, truth)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("validation.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html").render(
+    return template("report.html").render(
         title=scores.scenario if scores else measurement.recording.title,
         m=measurement,
         volumes=of_volumes(measurement),

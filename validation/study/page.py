@@ -6,12 +6,12 @@ import base64
 from importlib.metadata import version
 from pathlib import Path
 
-import jinja2
 import numpy as np
 import pandas as pd
 
 from validation.batch.doubts import doubted
 from validation.batch.engine import FAILED
+from validation.report.template import template
 from validation.study.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
 from validation.study.description import Study
 from validation.study.figures import study_pictures
@@ -63,18 +63,11 @@ def _page(
     pictures: list[dict[str, str]],
     where: str,
 ) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("validation.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     failed = table[table["status"] != "done"]
     factors = [factor.column for factor in study.factor]
     columns = [*factors, "repetition", "reason", "key"]
     number, reasons = doubted(table)
-    return environment.get_template("study.html").render(
+    return template("study.html").render(
         study=study,
         text=text,
         runs=len(table),
