@@ -38,14 +38,21 @@ def compile_kernels(*, progress: Progress = silent) -> None:
     normal_equations(volume, rays, basis, still, views[:1], views[:1], voxel_mm=0.1)
     project(volume, rays, (geometry.rows, geometry.columns), basis, still, voxel_mm=0.1)
     progress(TASK, 2, 3)
-    first = np.zeros(1, dtype=np.int64)
     shape = (geometry.rows, geometry.columns)
-    systematic = Systematic(fields=views[:1], first=first, second=first, share=np.zeros(1), corner=(0, 0), shape=shape)
+    systematic = Systematic(
+        left=lambda i: views[i],
+        view_rad=angle,
+        step_rad=angle[:1],
+        corner=(0, 0),
+        shape=shape,
+        detector=shape,
+        width_rad=0.1,
+    )
     systematic.registered(slice(0, 1), rays, basis, still, 0.1)
     images = Images(
         rays=rays, grey=views[:1], weight=views[:1], volume=volume, systematic=systematic, voxel_mm=grid.voxel_mm
     )
-    propagate(images, systematic, basis, still, np.ones((1, 1)), known_from_residual(1.0, shape, shape, 0), views[:1])
+    propagate(images, systematic, basis, still, np.ones((1, 1)), known_from_residual(1.0, shape, shape, 0))
     progress(TASK, 3, 3)
 
 

@@ -115,6 +115,20 @@ def linearise(
     return Equations(matrix=matrix, vector=vector, chi2=chi2, residual=residual, pixels=images.used_pixels)
 
 
+def joined(blocks: Floats, time_functions: Floats, others: Floats | None = None) -> Floats:
+    """Return sum_n sigma(n) sigma'(n)^T (x) block(n): of B(t), the Hessian of all unknowns.
+
+    `blocks` (n, unknown, unknown), with unknown = section * motion; `time_functions` (function, n), and `others` the
+    same, or those of the other one of two steps that a block joins. Returns (function * unknown, function * unknown).
+    """
+    functions, count = time_functions.shape
+    size = blocks.shape[1]
+    second = time_functions if others is None else others
+    pairs = np.einsum("ft,gt->fgt", time_functions, second).reshape(-1, count)
+    found = (pairs @ blocks.reshape(count, -1)).reshape(functions, functions, size, size)
+    return np.ascontiguousarray(found.transpose(0, 2, 1, 3)).reshape(functions * size, functions * size)
+
+
 def residuals(
     images: Images, basis: SectionBasis, amplitude: Floats, *, progress: Progress = silent, task: str = "residual"
 ) -> Image:

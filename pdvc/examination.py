@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.experiment import REFERENCE, TEST, Experiment
+from pdvc.geometry import gaps_rad
 from pdvc.likeness import Likeness, likeness
 from pdvc.onset import onset
 from pdvc.progress import Progress, silent
 from pdvc.radiographs import Calibration, calibrate, detector_noise
-from pdvc.reconstruction import gaps_rad
 from pdvc.seen_twice import SeenTwice, seen_twice
 
 Floats = NDArray[np.float64]

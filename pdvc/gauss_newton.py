@@ -23,7 +23,7 @@ from pydantic import Field
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from pdvc.equations import Equations, Linearise
+from pdvc.equations import Equations, Linearise, joined
 from pdvc.prior import Prior, solved
 from pdvc.solution import SHORTER, Problem, Solution, Solver, evaluated, lowers
 from pdvc.verdict import Stop
@@ -47,18 +47,6 @@ def blocks_of(time_functions: Floats) -> tuple[Block, ...]:
     count, label = connected_components(csr_array(used @ used.T), directed=False)
     members = [np.flatnonzero(label == k) for k in range(count)]
     return tuple(Block(functions=own, steps=np.flatnonzero(used[own].any(axis=0))) for own in members)
-
-
-def hessian(matrices: Floats, time_functions: Floats) -> Floats:
-    """Return sum_t sigma sigma^T (x) B(t), from B (step, unknown, unknown) and sigma (function, step).
-
-    Of shape (function * unknown, function * unknown), with unknown = section * motion.
-    """
-    functions, steps = time_functions.shape
-    size = matrices.shape[1]
-    pairs = np.einsum("ft,gt->fgt", time_functions, time_functions).reshape(-1, steps)
-    blocks = (pairs @ matrices.reshape(steps, -1)).reshape(functions, functions, size, size)
-    return np.ascontiguousarray(blocks.transpose(0, 2, 1, 3)).reshape(functions * size, functions * size)
 
 
 class GaussNewton(Solver):
@@ -139,7 +127,7 @@ def _change(equations: Equations, time_functions: Floats, coefficients: Floats, 
     own, part = time_functions[np.ix_(block.functions, block.steps)], _of(equations, block)
     now = coefficients[block.functions]
     ridge = np.tile(prior.ridge(part.rms), len(own))
-    matrix = hessian(part.matrix, own)
+    matrix = joined(part.matrix, own)
     matrix[np.diag_indices_from(matrix)] += ridge
     vector = (own @ part.vector).ravel() - ridge * now.ravel()
     return solved(matrix, vector).reshape(now.shape)

@@ -31,6 +31,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 @dataclass(frozen=True, kw_only=True)
 class ConeBeam:
@@ -117,3 +120,8 @@ class ConeBeam:
             column_shift_mm=self.column_shift_mm + c * along_columns - s * along_rows,
             row_shift_mm=self.row_shift_mm + s * along_columns + c * along_rows,
         )
+
+
+def gaps_rad(turned_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the gaps (angle,) from each of the increasing angles of a turn to the next, over the turn's end too."""
+    return np.diff(np.append(turned_rad, turned_rad[0] + 2 * np.pi))

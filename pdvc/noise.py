@@ -16,31 +16,34 @@ all images. The noise of h = sum_t sigma(t) (x) S(t)^T W rho(t) has therefore th
 Filtering the radiographs first (`radiographs.smoothed`) puts G S for S here, where S meets noise: G S is taken as the
 sensitivity of the volume filtered once more, which is exact in a parallel beam.
 
-with a_tv the share of view v at step t. The noise of the reference volume itself moves with the sample: re-projected
-and subtracted again it cancels, and that of the reference views takes its place. Where e is not subtracted, the
-re-projected volume holds at most the same noise, so that V is then an upper bound.
+with a_tv the share of view v at step t: e is a mean over the views around the step's direction. The noise of the
+reference volume itself moves with the sample: re-projected and subtracted again it cancels, and that of the reference
+views takes its place. Where e is not subtracted, the re-projected volume holds at most the same noise, so that V is
+then an upper bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pdvc.equations import Images
+from pdvc.equations import Images, joined
 from pdvc.measurement import ResidualTests
 from pdvc.progress import Progress, silent
 from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import noise_overlap, smoothed
 from pdvc.sections import SectionBasis
-from pdvc.systematic import Systematic
+from pdvc.systematic import Sight, Systematic, first_pixel, keys_weights, taps
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+SOURCES = ("radiographs", "views", "flats")
+"""Where noise comes from."""
 _BLOCK_ROWS = 16
 
 
@@ -61,7 +64,7 @@ class Noise:
     step: Callable[[int], ImageNoise]
     """Of a step's radiograph, over the window."""
     view: Callable[[int], ImageNoise]
-    """Of a reference view, over the whole detector; numbered as `Systematic.fields`."""
+    """Of a reference view, over the whole detector."""
     flat: Image
     """Variance of the mean flat, relative to it (row, column), over the whole detector."""
     smooth_px: float = 0.0
@@ -71,9 +74,12 @@ class Noise:
 def known_from_residual(rms: float, window: tuple[int, int], detector: tuple[int, ...], smooth_px: float) -> Noise:
     """Return what to believe where the detector's noise is unknown: the residual is noise, of views and steps alike.
 
-    Interpolating a view leaves (2/3)^2 of its variance on average, the filter what `noise_overlap` tells.
+    Interpolating leaves a share of a view's variance, on average over places between pixels and between views; the
+    filter leaves what `noise_overlap` tells.
     """
-    variance = rms**2 / noise_overlap(smooth_px)[0] ** 2 / (1 + 4 / 9)
+    between = np.linspace(0, 1, 101)
+    left = float(np.mean(np.sum(np.square(taps(between, np.zeros(101, dtype=np.int64))), axis=0))) ** 2 * 2 / 3
+    variance = rms**2 / noise_overlap(smooth_px)[0] ** 2 / (1 + left)
 
     def uniform(shape: tuple[int, ...]) -> ImageNoise:
         return ImageNoise(variance=np.full(shape, variance, np.float32), slope=np.zeros(shape, np.float32))
@@ -93,8 +99,8 @@ class Propagated:
     parts: Mapping[str, Floats]
     """By source, ``radiographs``, ``views`` and ``flats``: (function * unknown, function * unknown), or (function,
     unknown, unknown) where functions share no step."""
-    tests: ResidualTests
-    """Whether the residual is that noise."""
+    own: Mapping[str, Floats]
+    """The same of each step's c alone (step, unknown, unknown)."""
 
     @property
     def covariance(self) -> Floats:
@@ -109,68 +115,77 @@ def propagate(
     amplitude: Floats,
     time_functions: Floats,
     noise: Noise,
-    residual: Image,
     *,
     progress: Progress = silent,
 ) -> Propagated:
-    """Return the covariance of h at amplitudes (step, section, motion), voxels, and tests of the residual there.
+    """Return the covariance of h at amplitudes (step, section, motion), voxels.
 
-    `systematic` tells which views each step looks along, whether it is subtracted or not. `residual` (step, row,
-    column), grey levels, is tested only. Costs a pass over all radiographs, and about as much again.
+    `systematic` tells which views each step looks along, whether it is subtracted or not. Costs a pass over all
+    radiographs, and about as much again.
     """
     volume = replace(images.volume, values=smoothed(images.volume.values, noise.smooth_px))
     images = replace(images, volume=volume)
     apart = separate(time_functions)
     unknowns = basis.shape[0] * basis.shape[1]
-    own: dict[tuple[int, int], Floats] = {}
+    own = {name: np.empty((len(amplitude), unknowns, unknowns)) for name in SOURCES}
     pairs: dict[tuple[int, int], Floats] = {}
-    static = np.zeros((len(time_functions), unknowns, unknowns)) if apart else None
-    pile = Pile(noise.flat.shape, time_functions, basis.shape[1])
-    tests = _Tests(noise_overlap(noise.smooth_px))
-    users, last_use = _users(systematic)
+    pile = None if apart else Pile(noise.flat.shape, time_functions, basis.shape[1])
+    sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
     held: dict[int, Sensitivities] = {}
-    done = 0
 
     def add_step(t: int, field: Sensitivities) -> Sensitivities:
         """Add what the step's own noise and the flats' do; return Y, which its views' noise needs."""
         weight, image = images.weight[t % len(images.weight)], noise.step(t)
         weighted = replace(field, values=field.values * weight[..., None])
-        own[t, t] = product(weighted, weighted, image.variance, unknowns)
-        places = systematic.places(images.rays[t], basis, amplitude[t], images.voxel_mm)
+        places = systematic.places(t, images.rays[t], basis, amplitude[t], images.voxel_mm)
         moved = _spread(weighted, places, noise.flat.shape)
-        view = _between(noise, systematic, t)
-        here = pile if static is None else Pile(noise.flat.shape, np.ones((1, len(amplitude))), basis.shape[1])
-        here.add(t, moved, view.slope, (0, 0))
-        here.add(t, weighted, -image.slope, systematic.corner)
-        if static is not None:
-            static[time_functions[:, t] != 0] += here.covariance(noise.flat, unknowns)
-        tests.add(residual[t], weight > 0, image, view, noise.flat, places, systematic.corner)
+        view = _mean(noise, sight.of_step(t))
+        own["radiographs"][t] = product(weighted, weighted, image.variance, unknowns)
+        own["views"][t] = product(moved, moved, view.variance, unknowns)
+        both = [(moved, view.slope, (0, 0)), (weighted, -image.slope, systematic.corner)]
+        shared = overlaid(both, noise.flat.shape)
+        own["flats"][t] = product(shared, shared, noise.flat, unknowns)
+        if pile is not None:
+            pile.add(t, shared)
         return moved
 
-    for view in sorted(users):
-        wanted = [t for t in users[view] if t not in held]
-        for t, field in _fields(images, basis, amplitude, wanted):
-            held[t] = add_step(t, field)
-            done += 1
-            progress("uncertainty", done, len(amplitude))
-        variance = noise.view(view).variance
-        for i, t in enumerate(users[view]):
-            for other in users[view][: i + 1]:
-                if t == other or not apart:
-                    share = _share(systematic, t, view) * _share(systematic, other, view)
-                    _add(pairs, (t, other), product(held[t], held[other], share * variance, unknowns))
-        for t in users[view]:
-            if last_use[t] == view:
-                del held[t]
-    flats = pile.covariance(noise.flat, unknowns) if static is None else _scaled(static, time_functions)
-    return Propagated(
-        parts={
-            "radiographs": _joined(own, time_functions, apart),
-            "views": _joined(pairs, time_functions, apart),
-            "flats": flats,
-        },
-        tests=tests.result(time_functions.shape[0] * unknowns),
-    )
+    company = _company(sight, apart)
+    for done, (t, others) in enumerate(company.items()):
+        held[t] = add_step(t, _field(images, basis, amplitude, t))
+        for other, shares in others.items():
+            variance = np.sum([share * noise.view(view).variance for view, share in shares.items()], axis=0)
+            pairs[t, other] = product(held[t], held[other], variance, unknowns)
+        later = list(company.values())[done + 1 :]
+        held = {step: field for step, field in held.items() if any(step in known for known in later)}
+        progress("uncertainty", done + 1, len(amplitude))
+    joint = {
+        "radiographs": _joined(own["radiographs"], {}, time_functions),
+        "views": _joined(own["views"], pairs, time_functions),
+        "flats": _joined(own["flats"], {}, time_functions) if pile is None else pile.covariance(noise.flat, unknowns),
+    }
+    return Propagated(parts=joint, own=own)
+
+
+def residual_tests(
+    images: Images,
+    systematic: Systematic,
+    basis: SectionBasis,
+    amplitude: Floats,
+    noise: Noise,
+    residual: Image,
+    unknowns: int,
+) -> ResidualTests:
+    """Return whether the residual (step, row, column), grey levels, of a solution is the noise that is expected.
+
+    At amplitudes (step, section, motion), voxels; `unknowns` of all steps were found.
+    """
+    tests = _Tests(noise_overlap(noise.smooth_px))
+    sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
+    for t, rays in enumerate(images.rays):
+        places = systematic.places(t, rays, basis, amplitude[t], images.voxel_mm)
+        used, view = images.weight[t % len(images.weight)] > 0, _mean(noise, sight.of_step(t))
+        tests.add(residual[t], used, noise.step(t), view, noise.flat, places, systematic.corner)
+    return tests.result(unknowns)
 
 
 def separate(time_functions: Floats) -> bool:
@@ -179,48 +194,39 @@ def separate(time_functions: Floats) -> bool:
     return bool((filled.sum(axis=0) <= 1).all() and (filled.sum(axis=1) <= 1).all())
 
 
-def _users(systematic: Systematic) -> tuple[dict[int, list[int]], dict[int, int]]:
-    """Return the steps that use each view, and the last view that each step uses."""
+def _company(sight: Sight, apart: bool) -> dict[int, dict[int, dict[int, float]]]:
+    """Return the steps in the order of their views: each with the steps before it that share views with it.
+
+    For each view that both see, the product of their shares. Where the functions are apart, no company counts.
+    """
+    shares = {t: sight.of_step(t) for t in range(len(sight.views))}
+    order = sorted(shares, key=lambda t: (min(shares[t]), t))
+    found: dict[int, dict[int, dict[int, float]]] = {}
     users: dict[int, list[int]] = {}
-    for t in range(len(systematic.first)):
-        for view in np.unique([systematic.first[t], systematic.second[t]]).tolist():
-            if _share(systematic, t, view) > 0:
-                users.setdefault(view, []).append(t)
-    return users, {t: view for view in sorted(users) for t in users[view]}
-
-
-def _share(systematic: Systematic, step: int, view: int) -> float:
-    share = float(systematic.share[step])
-    found: float = (1 - share) * (systematic.first[step] == view) + share * (systematic.second[step] == view)
+    for t in order:
+        found[t] = {}
+        for view, share in shares[t].items():
+            for other in users.setdefault(view, []):
+                if not apart:
+                    found[t].setdefault(other, {})[view] = share * shares[other][view]
+            users[view].append(t)
     return found
 
 
-def _between(noise: Noise, systematic: Systematic, step: int) -> ImageNoise:
-    """Return the noise of what is interpolated between the views that a step looks along."""
-    views = {int(systematic.first[step]), int(systematic.second[step])}
-    shares = {view: np.float32(_share(systematic, step, view)) for view in views}
-    found = {view: noise.view(view) for view in views if shares[view] > 0}
+def _mean(noise: Noise, shares: Mapping[int, float]) -> ImageNoise:
+    """Return the noise of a mean over views, by their shares."""
+    found = [(np.float32(share), noise.view(view)) for view, share in shares.items()]
     return ImageNoise(
-        variance=np.sum([shares[v] ** 2 * each.variance for v, each in found.items()], axis=0),
-        slope=np.sum([shares[v] * each.slope for v, each in found.items()], axis=0),
+        variance=np.sum([share**2 * each.variance for share, each in found], axis=0),
+        slope=np.sum([share * each.slope for share, each in found], axis=0),
     )
 
 
-def _fields(
-    images: Images, basis: SectionBasis, amplitude: Floats, wanted: list[int]
-) -> Iterator[tuple[int, Sensitivities]]:
-    """Yield the sensitivities of the wanted steps."""
-    if not wanted:
-        return
+def _field(images: Images, basis: SectionBasis, amplitude: Floats, step: int) -> Sensitivities:
+    """Return the sensitivities of a step."""
     shape = (images.grey.shape[1], images.grey.shape[2])
-    found = sensitivities(
-        images.volume, images.rays[wanted], shape, basis, amplitude[wanted], voxel_mm=images.voxel_mm
-    )
-    yield from zip(wanted, found, strict=True)
-
-
-def _add(pairs: dict[tuple[int, int], Floats], key: tuple[int, int], block: Floats) -> None:
-    pairs[key] = pairs[key] + block if key in pairs else block
+    one = slice(step, step + 1)
+    return sensitivities(images.volume, images.rays[one], shape, basis, amplitude[one], voxel_mm=images.voxel_mm)[0]
 
 
 def product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns: int) -> Floats:
@@ -231,31 +237,22 @@ def product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns:
     return result
 
 
-def _joined(pairs: dict[tuple[int, int], Floats], time_functions: Floats, apart: bool) -> Floats:
-    """Return the sum over pairs of steps of sigma(t) sigma(t')^T (x) their block."""
-    functions = len(time_functions)
-    unknowns = len(next(iter(pairs.values())))
-    if apart:
-        blocks = np.zeros((functions, unknowns, unknowns))
+def _joined(own: Floats, pairs: Mapping[tuple[int, int], Floats], time_functions: Floats) -> Floats:
+    """Return the sum over steps, and over pairs of them, of sigma(t) sigma(t')^T (x) their block.
+
+    Pairs hold one of (t, t') and (t', t), whose block is the transpose.
+    """
+    if separate(time_functions):
+        blocks = np.zeros((len(time_functions), *own.shape[1:]))
         for f, t in zip(*np.nonzero(time_functions), strict=True):
-            blocks[f] = time_functions[f, t] ** 2 * pairs[t, t]
+            blocks[f] = time_functions[f, t] ** 2 * own[t]
         return blocks
-    total = np.zeros((functions * unknowns, functions * unknowns))
-    for same in (True, False):
-        chosen = [key for key in pairs if (key[0] == key[1]) == same]
-        if not chosen:
-            continue
-        t, other = np.array(chosen).T
-        shares = (time_functions[:, None, t] * time_functions[None, :, other]).reshape(-1, len(chosen))
-        sums = shares @ np.stack([pairs[key] for key in chosen]).reshape(len(chosen), -1)
-        matrix = sums.reshape(functions, functions, unknowns, unknowns).transpose(0, 2, 1, 3).reshape(total.shape)
-        total += matrix if same else matrix + matrix.T
+    total = joined(own, time_functions)
+    if pairs:
+        t, other = np.array(list(pairs)).T
+        apart = joined(np.stack(list(pairs.values())), time_functions[:, t], time_functions[:, other])
+        total += apart + apart.T
     return total
-
-
-def _scaled(blocks: Floats, time_functions: Floats) -> Floats:
-    """Return the blocks (function, unknown, unknown) times the square of the one value of each function."""
-    return np.asarray(blocks * (time_functions**2).sum(axis=1)[:, None, None])
 
 
 class Pile:
@@ -269,23 +266,13 @@ class Pile:
         self._first: dict[int, int] = {}
         self._blocks: dict[int, Image] = {}
 
-    def add(self, step: int, field: Sensitivities, factor: Image, corner: tuple[int, int]) -> None:
-        """Add factor (row, column) times a step's field, whose first pixel is `corner` on the detector."""
-        rows = len(field.values)
-        for block in range(corner[0] // _BLOCK_ROWS, (corner[0] + rows - 1) // _BLOCK_ROWS + 1):
-            low = max(block * _BLOCK_ROWS, corner[0])
-            high = min((block + 1) * _BLOCK_ROWS, corner[0] + rows)
-            inside = slice(low - corner[0], high - corner[0])
-            z, first = self._room_for(block, field, inside)
-            _pile_up(
-                z,
-                low - block * _BLOCK_ROWS,
-                corner[1],
-                field.values[inside],
-                (field.first[inside] - first) * self._motions,
-                factor[inside],
-                self._functions[:, step],
-            )
+    def add(self, step: int, field: Sensitivities) -> None:
+        """Add a step's field over the detector."""
+        for block in range((len(field.values) - 1) // _BLOCK_ROWS + 1):
+            rows = slice(block * _BLOCK_ROWS, min((block + 1) * _BLOCK_ROWS, len(field.values)))
+            z, first = self._room_for(block, field, rows)
+            offset = (field.first[rows] - first) * self._motions
+            _pile_up(z, field.values[rows], offset, self._functions[:, step])
 
     def _room_for(self, block: int, field: Sensitivities, rows: slice) -> tuple[Image, int]:
         """Return a block of pixels (row, column, function, section * motion), wide enough, and its first section."""
@@ -339,16 +326,24 @@ class _Tests:
         """
         c = self._overlap
         at = [np.clip(places[..., k].astype(int), 0, flat.shape[k] - 2) for k in range(2)]
-        a, b = (places[..., k] - at[k] for k in range(2))
-        # interpolated between two pixels whose noise overlaps: variance along an axis, and covariance with the next
-        same = [((1 - x) ** 2 + x**2) * c[0] + 2 * x * (1 - x) * c[1] for x in (a, b)]
-        following = [((1 - x) ** 2 + x**2) * c[1] + x * (1 - x) * (c[0] + c[2]) for x in (a, b)]
+        weights = [taps(places[..., k], at[k]) for k in range(2)]
+
+        def lagged(tap: Floats, lag: int) -> Floats:
+            """Return the covariance along an axis of what is interpolated so, with the same `lag` pixels on."""
+            between = np.array([[_of_lag(c, m + lag - n) for n in range(4)] for m in range(4)])
+            return np.asarray(np.einsum("m...,mn,n...->...", tap, between, tap, optimize=True))
+
+        same, following = [lagged(each, 0) for each in weights], [lagged(each, 1) for each in weights]
         pixel = np.indices(residual.shape) + np.array(corner)[:, None, None]
 
-        def flats(shift: int) -> tuple[Floats, Floats]:
+        def flats(shift: int) -> list[Floats]:
             """Return the covariance of a pixel with its place, moved by a shift, along each axis."""
-            lags = [np.minimum(np.abs(at[k] + n + shift - pixel[k]), len(c) - 1) for k in range(2) for n in range(2)]
-            return (1 - a) * c[lags[0]] + a * c[lags[1]], (1 - b) * c[lags[2]] + b * c[lags[3]]
+            return [
+                np.asarray(
+                    sum(weights[k][m] * _of_lag(c, at[k] - 1 + m + shift - pixel[k]) for m in range(4)), dtype=float
+                )
+                for k in range(2)
+            ]
 
         (down, across), before, after = flats(0), flats(-1), flats(1)
         here = flat[pixel[0], pixel[1]]
@@ -386,10 +381,31 @@ class _Tests:
         )
 
 
+def _of_lag(overlap: Floats, lag: NDArray[np.int64] | int) -> Floats:
+    """Return the covariance of filtered noise at a lag of pixels along an axis; zero beyond the filter's reach."""
+    return np.asarray(overlap[np.minimum(np.abs(lag), len(overlap) - 1)])
+
+
+def overlaid(fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]], shape: tuple[int, ...]) -> Sensitivities:
+    """Return the sum, over a detector of `shape`, of fields times factors (row, column), from their first pixel on."""
+    motions = fields[0][0].motions
+    low, high = np.full(shape[0], np.iinfo(np.int64).max), np.zeros(shape[0], dtype=np.int64)
+    for field, _, (row, _) in fields:
+        rows = slice(row, row + len(field.values))
+        low[rows] = np.minimum(low[rows], field.first)
+        high[rows] = np.maximum(high[rows], field.first + field.values.shape[2] // motions)
+    low = np.where(high > 0, low, 0)
+    values = np.zeros((*shape, max(int((high - low).max()), 1) * motions), dtype=np.float32)
+    for field, factor, (row, column) in fields:
+        first = low[row : row + len(field.values)]
+        _add_to(values, field.values, (field.first - first) * motions, factor, row, column)
+    return Sensitivities(values=values, first=low, motions=motions)
+
+
 def _spread(field: Sensitivities, places: Floats, shape: tuple[int, ...]) -> Sensitivities:
     """Return R^T of a field over the window: what each pixel of the detector takes part in."""
     row = np.clip(np.floor(places[..., 0]).astype(np.int64), 0, shape[0] - 2)
-    top, bottom = row.min(axis=1), row.max(axis=1) + 1
+    top, bottom = np.maximum(row.min(axis=1) - 1, 0), np.minimum(row.max(axis=1) + 2, shape[0] - 1)
     span = field.values.shape[2] // field.motions
     low, high = np.full(shape[0], np.iinfo(np.int64).max), np.zeros(shape[0], dtype=np.int64)
     for first, start, end in zip(field.first, top, bottom, strict=True):
@@ -427,45 +443,63 @@ def _add_product(one, first, other, second, variance, out):  # type: ignore[no-u
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
-    """Add each pixel's values to the four pixels that it was interpolated from; the adjoint of `_bilinear`.
+    """Add each pixel's values to the 4 x 4 pixels that it was interpolated from; the adjoint of `systematic._cubic`.
 
     One thread: neighbours add to the same pixels, and always in this order.
     """
     rows, columns = out.shape[0], out.shape[1]
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
+            # most carry something only inside the sample
+            empty = True
+            for k in range(values.shape[2]):
+                if values[row, column, k] != 0:
+                    empty = False
+                    break
             r, c = places[row, column]
-            # limits and shares as in `systematic._bilinear`, or it would not be the adjoint
-            if r < -0.01 or r > rows - 0.99 or c < -0.01 or c > columns - 0.99:
+            i, j = first_pixel(r, rows), first_pixel(c, columns)
+            if empty or i < 0 or j < 0:
                 continue
-            i, j = min(max(int(r), 0), rows - 2), min(max(int(c), 0), columns - 2)
-            a, b = r - i, c - j
-            for di in range(2):
-                for dj in range(2):
-                    share = np.float32((a if di else 1 - a) * (b if dj else 1 - b))
-                    # where the sections of this row of the window begin in that row of the detector
-                    start = offset[row, i + di]
-                    for k in range(values.shape[2]):
-                        out[i + di, j + dj, start + k] += share * values[row, column, k]
+            down, right = keys_weights(r - i), keys_weights(c - j)
+            for m in range(4):
+                to_row = min(max(i - 1 + m, 0), rows - 1)
+                # where the sections of this row of the window begin in that row of the detector
+                start = offset[row, to_row]
+                for n in range(4):
+                    share = np.float32(down[m] * right[n])
+                    if share != 0:
+                        to = out[to_row, min(max(j - 1 + n, 0), columns - 1)]
+                        for k in range(values.shape[2]):
+                            to[start + k] += share * values[row, column, k]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _add_to(out, values, offset, factor, row0, column0):  # type: ignore[no-untyped-def]
+    """Add factor(p) values(p, k) to out, which starts row0 and column0 earlier, `offset` (row,) entries on."""
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            scale = factor[row, column]
+            for k in range(values.shape[2]):
+                # room beyond the last section is empty
+                if values[row, column, k] != 0:
+                    out[row0 + row, column0 + column, offset[row] + k] += scale * values[row, column, k]
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _pile_up(z, row0, column0, values, offset, factor, sigma):  # type: ignore[no-untyped-def]
-    """Add sigma_f factor(p) values(p, k) to z (row, column, f, k), which starts row0 and column0 earlier."""
+def _pile_up(z, values, offset, sigma):  # type: ignore[no-untyped-def]
+    """Add sigma_f values(p, k) to z (row, column, f, k)."""
     size = values.shape[2]
-    scaled = np.empty(size, dtype=np.float32)
     for row in range(values.shape[0]):
         # unsigned: numba need not ask whether an index counts from the end
         start = np.uint32(offset[row])
         for column in range(values.shape[1]):
-            # the product that all functions share is taken once, and pixels in air are left out
+            # pixels in air are left out
             largest = np.float32(0)
             for k in range(size):
-                scaled[k] = factor[row, column] * values[row, column, k]
-                largest = max(largest, abs(scaled[k]))
+                largest = max(largest, abs(values[row, column, k]))
             if largest == 0:
                 continue
             for f in range(len(sigma)):
-                out = z[row0 + row, column0 + column, f]
+                out = z[row, column, f]
                 for k in range(size):
-                    out[start + np.uint32(k)] += sigma[f] * scaled[k]
+                    out[start + np.uint32(k)] += sigma[f] * values[row, column, k]

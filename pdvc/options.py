@@ -8,12 +8,13 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from pdvc.experiment import Experiment
-from pdvc.gauss_newton import GaussNewton
+from pdvc.gauss_newton import GaussNewton  # noqa: F401 - a kind of solver that options may name
 from pdvc.geometry import ConeBeam
 from pdvc.history import PAPER, Ramp, TimeFunction, settled
 from pdvc.pgd import Pgd
 from pdvc.sections import CONTRACTION, RIGID, SectionPattern, motions_named, names_of, offered_motions
 from pdvc.settings import Settings, load_plugins
+from pdvc.smoother import Smoother
 from pdvc.solution import Solver
 
 
@@ -64,7 +65,7 @@ COARSE_TO_FINE_RIGID = (
 )
 COARSE_TO_FINE = (
     StageOptions(scale=2, solver=Pgd(most_modes=4, passes_per_mode=8)),
-    StageOptions(scale=1, solver=GaussNewton(most_passes=4)),
+    StageOptions(scale=1, solver=Smoother()),
 )
 
 
@@ -93,6 +94,8 @@ class MeasureOptions(Settings):
     """third-order polynomial: fitted from the reference views, none, or c1, c2, c3 of attenuation"""
     smooth_px: Annotated[float, Field(ge=0, le=5)] = 0.7
     """standard deviation of the Gaussian that all radiographs are filtered with first, px; 0: none"""
+    sharpen: bool = True
+    """sharpen the reference views, for the volume only, by what interpolation blurs"""
     subtract_systematic: bool = True
     """subtract what re-projecting the volume leaves of the reference views, registered"""
     weighting: Literal["uniform", "noise"] = "uniform"
@@ -183,6 +186,7 @@ def paper_options() -> MeasureOptions:
         section_motions=names_of(RIGID),
         time=PAPER,
         smooth_px=0.0,
+        sharpen=False,
         rigid=(StageOptions(scale=2, solver=Pgd(most_modes=8)),),
         deformation=(StageOptions(scale=1, solver=Pgd(most_modes=4)),),
     )

@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 
 from pdvc.deviations import Knowledge, beam_frame
 from pdvc.digest import digest
-from pdvc.equations import STEPS_AT_ONCE, Images, linearise
+from pdvc.equations import STEPS_AT_ONCE, Images, joined, linearise
 from pdvc.experiment import Experiment, Series
-from pdvc.gauss_newton import hessian
 from pdvc.history import time_basis
-from pdvc.noise import Pile, product
+from pdvc.noise import Pile, overlaid, product
 from pdvc.options import MeasureOptions
 from pdvc.preparation import prepare, stated_noise
 from pdvc.progress import Progress, silent
@@ -178,11 +177,11 @@ class Planner:
             else:
                 del alike[view]
             for t in np.flatnonzero(turn == k):
-                pile.add(int(t), field, -step.slope, self._corner)
-                pile.add(int(t), field, step.slope, was[t])
-        of_steps, of_views = hessian(noise[turn], functions), hessian(noise, shared)
+                moved = [(field, -step.slope, self._corner), (field, step.slope, was[t])]
+                pile.add(int(t), overlaid(moved, self._noise.flat.shape))
+        of_steps, of_views = joined(noise[turn], functions), joined(noise, shared)
         covariance = of_steps + of_views + between.reshape(of_views.shape)
-        return hessian(matrix[turn], functions), covariance, pile.covariance(self._noise.flat, matrix.shape[1])
+        return joined(matrix[turn], functions), covariance, pile.covariance(self._noise.flat, matrix.shape[1])
 
     def _nearest(self, angle_rad: Floats) -> NDArray[np.intp]:
         """Return the reference views nearest to angles."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +25,16 @@ from pdvc.radiographs import (
     detector_noise,
     grey_levels,
     grey_noise,
+    sharpened,
     smoothed,
     snr_db,
 )
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import fdk
+from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, set_up
 from pdvc.store import Keep
-from pdvc.systematic import Neighbours, Systematic, neighbouring_views
+from pdvc.systematic import Systematic
 from pdvc.volume import Hull, Volume
 from pdvc.window import reached_rows, scan_grid
 
@@ -40,6 +42,8 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 _HULL_MARGIN_VOXEL = 3.0
+_VIEWS_AT_HAND = 16
+"""Reference views whose noise is kept: steps that follow each other look along some of the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +53,8 @@ class Prepared:
     images: Images
     systematic: Systematic
     """What the volume's re-projection leaves, whether or not it is subtracted."""
-    views: NDArray[np.int64]
-    """The reference views that `systematic.fields` belong to."""
-    snr_reprojection_db: Floats
+    view: Callable[[int], Image]
+    """A reference view (row, column), grey levels, over the whole detector."""
     snr_noise_db: Floats
     noise_rms: float | None
 
@@ -64,7 +67,7 @@ def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:
     used = geometry.cropped(*part)
     view = _viewer(experiment.reference, setup.calibration, scale, options.smooth_px)
     volume = reference_volume(setup, scale, progress)
-    systematic, views, snr_reprojection = _systematic(experiment, geometry, part, view, volume, progress)
+    systematic = _systematic(experiment, geometry, part, view, volume, setup.sections.radius_mm)
     grey, variance = _test_radiographs(experiment, setup.calibration, part, scale, options.smooth_px, progress)
     good = ~_coarse_bad(setup.calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
     if not good.any():
@@ -88,8 +91,7 @@ def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:
             voxel_mm=experiment.geometry.voxel_mm,
         ),
         systematic=systematic,
-        views=views,
-        snr_reprojection_db=snr_reprojection,
+        view=view,
         snr_noise_db=_noise_snr(grey, variance, good),
         noise_rms=None if variance is None else float(np.sqrt(variance[:, good].mean(dtype=float))),
     )
@@ -108,10 +110,10 @@ def keep_volumes(
         reference_volume(setup, scale, progress)
 
 
-def volume_choices(options: MeasureOptions, geometry: ConeBeam) -> tuple[tuple[int, ...], object, float]:
-    """Return what volumes of a scanner depend on, of some options: scales, beam hardening, and filter."""
+def volume_choices(options: MeasureOptions, geometry: ConeBeam) -> tuple[tuple[int, ...], object, float, bool]:
+    """Return what volumes of a scanner depend on, of some options: scales, beam hardening, filter, sharpening."""
     scales = {stage.at(geometry).scale for stage in (*options.rigid, *options.deformation)}
-    return tuple(sorted(scales, reverse=True)), options.beam_hardening, options.smooth_px
+    return tuple(sorted(scales, reverse=True)), options.beam_hardening, options.smooth_px, options.sharpen
 
 
 def _viewer(series: Series, calibration: Calibration, scale: int, smooth_px: float) -> Callable[[int], Image]:
@@ -123,10 +125,21 @@ def _viewer(series: Series, calibration: Calibration, scale: int, smooth_px: flo
 
 def reference_volume(setup: Setup, scale: int, progress: Progress = silent) -> Volume:
     """Reconstruct the reference scan at a scale; every experiment with the same reference scan finds it kept."""
-    calibration, hull, smooth_px = setup.calibration, setup.outline.hull, setup.options.smooth_px
-    keep = partial(setup.store.of_reference, "volume", (calibration, hull, scale, smooth_px))
+    calibration, hull = setup.calibration, setup.outline.hull
+    care = Care(smooth_px=setup.options.smooth_px, sharpen=setup.options.sharpen)
+    keep = partial(setup.store.of_reference, "volume", (calibration, hull, scale, care))
     series = setup.experiment.reference
-    return scan_volume(series, setup.geometry, calibration, hull, scale, smooth_px, keep, progress)
+    return scan_volume(series, setup.geometry, calibration, hull, scale, care, keep, progress)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Care:
+    """What is done for a volume beyond reconstructing it."""
+
+    smooth_px: float = 0.0
+    """Filter of the radiographs, px."""
+    sharpen: bool = False
+    """Whether radiographs are sharpened by what interpolation blurs."""
 
 
 def scan_volume(
@@ -135,17 +148,20 @@ def scan_volume(
     calibration: Calibration,
     hull: Hull,
     scale: int,
-    smooth_px: float,
+    care: Care,
     keep: Keep,
     progress: Progress,
 ) -> Volume:
     """Reconstruct a full scan at a scale, inside a hull; `geometry` is that of scale 1."""
-    view, geometry = _viewer(series, calibration, scale, smooth_px), geometry.binned(scale)
+    view, geometry = _viewer(series, calibration, scale, care.smooth_px), geometry.binned(scale)
     grid = scan_grid(geometry, hull)
+
+    def seen(i: int) -> Image:
+        return sharpened(view(i)) if care.sharpen else view(i)
 
     def reconstructed() -> dict[str, NDArray[np.float32]]:
         task = f"reconstruct {geometry.voxel_mm * 1e3:.1f} um"
-        return {"F": fdk(view, geometry, series.angle_rad, grid, hull, progress=progress, task=task)}
+        return {"F": fdk(seen, geometry, series.angle_rad, grid, hull, progress=progress, task=task)}
 
     values = keep(reconstructed)["F"]
     return Volume(values=values, grid=grid, hull=hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm))
@@ -157,32 +173,31 @@ def _systematic(
     part: tuple[int, ...],
     view: Callable[[int], Image],
     volume: Volume,
-    progress: Progress,
-) -> tuple[Systematic, NDArray[np.int64], Floats]:
-    """Re-project the volume at the reference views next to the steps' angles."""
-    reference = experiment.reference.angle_rad
-    near: Neighbours = neighbouring_views(reference, experiment.test.angle_rad)
-    needed = np.unique(np.concatenate([near.first, near.second]))
-    rays = ray_vectors(geometry, reference[needed]).stacked()
-    fields = np.zeros((len(needed), geometry.rows, geometry.columns), dtype=np.float32)
-    snr = np.empty(len(needed))
+    radius_mm: float,
+) -> Systematic:
+    """Return what re-projecting the volume leaves; views are re-projected as steps are found to look along them.
+
+    `radius_mm`, half of half the section's diagonal, tells within which angle e changes.
+    """
+    shape = (geometry.rows, geometry.columns)
     reached = reached_rows(geometry, volume.grid, volume.hull)
-    window = (slice(part[0], part[1]), slice(part[2], part[3]))
-    for n, i in enumerate(needed):
-        grey = view(int(i))
-        model = project_at_rest(volume, rays[n : n + 1], (geometry.rows, geometry.columns))[0]
-        fields[n, reached] = (model - grey)[reached]
-        snr[n] = snr_db(grey[window], fields[n][window], np.ones_like(grey[window], dtype=bool))
-        progress("re-projection", n + 1, len(needed))
-    systematic = Systematic(
-        fields=fields,
-        first=np.searchsorted(needed, near.first),
-        second=np.searchsorted(needed, near.second),
-        share=near.share,
+    rays = ray_vectors(geometry, experiment.reference.angle_rad).stacked()
+
+    @cache
+    def left(i: int) -> Image:
+        field = np.zeros(shape, dtype=np.float32)
+        field[reached] = (project_at_rest(volume, rays[i : i + 1], shape)[0] - view(i))[reached]
+        return field
+
+    return Systematic(
+        left=left,
+        view_rad=experiment.reference.angle_rad,
+        step_rad=experiment.test.angle_rad,
         corner=(part[0], part[2]),
         shape=(part[1] - part[0], part[3] - part[2]),
+        detector=shape,
+        width_rad=0.5 * geometry.voxel_mm / radius_mm,
     )
-    return systematic, needed, snr
 
 
 def _test_radiographs(
@@ -226,9 +241,9 @@ def noise_of(setup: Setup, prepared: Prepared) -> Noise | None:
         window = (slice(row, row + rows), slice(column, column + columns))
         return ImageNoise(variance=variance[window], slope=slope[window])
 
-    def view(field: int) -> ImageNoise:
-        counts = experiment.reference.counts[prepared.views[field]]
-        variance, slope = grey_noise(counts, calibration, known)
+    @lru_cache(maxsize=_VIEWS_AT_HAND)
+    def view(i: int) -> ImageNoise:
+        variance, slope = grey_noise(experiment.reference.counts[i], calibration, known)
         return ImageNoise(variance=variance, slope=slope)
 
     flat = known.relative_variance(calibration.open_beam, len(experiment.flats))
@@ -271,6 +286,20 @@ def _noise_snr(grey: Image, variance: Image | None, good: NDArray[np.bool_]) -> 
             for g, v in zip(grey, variance, strict=True)
         ]
     )
+
+
+def snr_reprojection(prepared: Prepared, basis: SectionBasis, amplitude: Floats) -> Floats:
+    """Return the SNR (view,), dB, of the views that the steps look along, against the re-projected volume.
+
+    At amplitudes (step, section, motion), voxels; views in the order of the reference scan.
+    """
+    systematic, images = prepared.systematic, prepared.images
+    sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
+    (row, column), (rows, columns) = systematic.corner, systematic.shape
+    window = (slice(row, row + rows), slice(column, column + columns))
+    used = np.ones((rows, columns), dtype=bool)
+    views = np.unique(sight.views[sight.share > 0]).tolist()
+    return np.array([snr_db(prepared.view(i)[window], systematic.left(i)[window], used) for i in views])
 
 
 def snr_of(images: Images) -> Callable[[Image], Floats]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,15 @@ from pdvc.equations import Equations, check_size, linearise, residuals
 from pdvc.experiment import Experiment
 from pdvc.history import settled
 from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Stage
-from pdvc.noise import known_from_residual, propagate
+from pdvc.noise import Noise, Propagated, known_from_residual, propagate, residual_tests
 from pdvc.options import DEFAULT, MeasureOptions, ResolvedStage, check_discarded
-from pdvc.preparation import Prepared, noise_of, prepare, snr_of
+from pdvc.preparation import Prepared, noise_of, prepare, snr_of, snr_reprojection
 from pdvc.progress import Progress, silent
 from pdvc.result_checks import check_finite, doubts_of_result
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, set_up
-from pdvc.solution import Problem, Solution
-from pdvc.uncertainty import posterior
+from pdvc.solution import Known, Problem, Solution
+from pdvc.uncertainty import posterior, stated
 from pdvc.verdict import Stop, Verdict, explained_by
 from pdvc.volume import Volume
 
@@ -79,54 +79,50 @@ def _measured(
     solving = time.perf_counter()
     solver = _Protocol(setup, prepared, time_functions, progress)
     still = np.zeros((len(time_functions), *rigid.shape))
-    start = solver.run("rigid", rigid, setup.options.rigid, still, to_noise=False)
+    start = solver.run("rigid", rigid, setup.options.rigid, still, to_noise=False).coefficients
     start = sections.reproduced(start, rigid)
     standing = np.zeros((len(experiment.test), *sections.shape))
     initial = residuals(fine.images, sections, standing, progress=progress, task="initial residual")
     moved = np.einsum("ft,fjk->tjk", time_functions, start)
     after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
-    coefficients = solver.run("deformation", sections, setup.options.deformation, start, to_noise=True)
-    equations = solver.equations_at(sections, coefficients)
-    amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
+    found = solver.run("deformation", sections, setup.options.deformation, start, to_noise=True)
+    functions, amplitude = found.time_functions, np.einsum("ft,fjk->tjk", found.time_functions, found.coefficients)
+    equations = solver.equations_at(sections, amplitude)
     propagating = time.perf_counter()
-    noise = noise_of(setup, fine) or known_from_residual(
-        equations.rms, fine.systematic.shape, fine.systematic.fields.shape[1:], setup.options.smooth_px
-    )
-    propagated = propagate(
-        fine.images,
-        fine.systematic,
-        sections,
-        amplitude,
-        time_functions,
-        noise,
-        equations.residual,
-        progress=progress,
-    )
-    task = f"covariance of {len(time_functions) * standing[0].size} unknowns"
-    progress(task, 0, 1)
-    known = posterior(equations, time_functions, setup.prior(sections), propagated.parts)
-    progress(task, 1, 1)
+    prior = setup.prior(sections)
+    noise = solver.noise(equations)
+    if found.known is None:
+        propagated = propagate(fine.images, fine.systematic, sections, amplitude, functions, noise, progress=progress)
+        task = f"covariance of {len(functions) * standing[0].size} unknowns"
+        progress(task, 0, 1)
+        known = posterior(equations, functions, prior, propagated.parts)
+        progress(task, 1, 1)
+    else:
+        known = stated(found.known, equations, functions, prior)
+    unknowns = len(functions) * standing[0].size
+    tests = residual_tests(fine.images, fine.systematic, sections, amplitude, noise, equations.residual, unknowns)
+    snr_views = snr_reprojection(fine, sections, amplitude)
     amplitude[:, ~known.observed] = np.nan
     snr = snr_of(fine.images)
     ended = time.perf_counter()
-    found = Measurement(
+    measurement = Measurement(
         recording=setup.recording(),
         motion=MeasuredMotion(
             basis=sections,
-            time_functions=time_functions,
+            time_functions=functions,
             amplitude=amplitude,
             covariance=known.covariance,
             amplitude_std=np.where(known.observed[:, None], known.deviation, np.nan),
             data_share=np.where(known.observed[:, None], known.data_share, 0.0),
             observed=known.observed,
             std_by_source={
-                name: _on_the_axis(part, sections, known.observed, time_functions, experiment.test.angle_rad)
+                name: _on_the_axis(part, sections, known.observed, functions, experiment.test.angle_rad)
                 for name, part in known.by_source.items()
             },
         ),
         fit=Fit(
             stages=tuple(solver.stages),
-            snr_reprojection_db=fine.snr_reprojection_db,
+            snr_reprojection_db=snr_views,
             snr_initial_db=snr(initial),
             snr_rigid_db=snr(after_rigid),
             snr_final_db=snr(equations.residual),
@@ -134,7 +130,7 @@ def _measured(
             residual_initial=initial,
             residual_rigid=after_rigid,
             residual_final=equations.residual,
-            residual_tests=propagated.tests,
+            residual_tests=tests,
         ),
         provenance=Provenance(
             seconds={
@@ -146,7 +142,7 @@ def _measured(
             versions=versions(),
         ),
     )
-    return found, fine.images.volume
+    return measurement, fine.images.volume
 
 
 def _on_the_axis(
@@ -178,39 +174,58 @@ class _Protocol:
 
     def run(
         self, name: str, basis: SectionBasis, stages: tuple[ResolvedStage, ...], start: Floats, *, to_noise: bool
-    ) -> Floats:
+    ) -> _Found:
         """Solve the stages in turn from a start (function, section, motion), voxels; return where they end."""
+        found = _Found(time_functions=self._time_functions, coefficients=start, known=None)
         for stage in stages:
-            kept = self._setup.store.arrays(
-                "stage",
-                (name, self._setup.options, stage, basis, self._time_functions, start),
-                lambda stage=stage, start=start: _packed(self._solved(name, basis, stage, start, to_noise)),  # type: ignore[misc]
-            )
-            self.stages.append(
-                Stage(
-                    name=name,
-                    scale=stage.scale,
-                    solver=stage.solver.kind,
-                    unknowns=len(self._time_functions) * basis.shape[0] * basis.shape[1],
-                    temporal=kept["temporal"],
-                    spatial=kept["spatial"],
-                    rms=kept["rms"],
-                    stop=Stop(str(kept["stop"])),
-                    stop_reason=str(kept["stop_reason"]),
-                    last_change_voxel=float(kept["last_change"]),
-                )
-            )
-            start = kept["coefficients"]
-        return start
+            found = self._stage(name, basis, stage, found, to_noise)
+        return found
 
-    def equations_at(self, basis: SectionBasis, coefficients: Floats) -> Equations:
-        """Return the equations of scale 1 at a solution: the last pass, unless that was in an earlier run."""
-        if self._last is not None and np.array_equal(self._last[0], coefficients):
+    def _stage(self, name: str, basis: SectionBasis, stage: ResolvedStage, before: _Found, to_noise: bool) -> _Found:
+        functions = stage.solver.functions(self._time_functions)
+        start = before.coefficients
+        if functions is not before.time_functions:
+            # orthonormal, both
+            start = np.einsum("gt,ft,fjk->gjk", functions, before.time_functions, start) / functions.shape[1]
+        kept = self._setup.store.arrays(
+            "stage",
+            (name, self._setup.options, stage, basis, functions, start),
+            lambda: _packed(self._solved(name, basis, stage, functions, start, to_noise)),
+        )
+        self.stages.append(
+            Stage(
+                name=name,
+                scale=stage.scale,
+                solver=stage.solver.kind,
+                unknowns=len(functions) * basis.shape[0] * basis.shape[1],
+                temporal=kept["temporal"],
+                spatial=kept["spatial"],
+                rms=kept["rms"],
+                stop=Stop(str(kept["stop"])),
+                stop_reason=str(kept["stop_reason"]),
+                last_change_voxel=float(kept["last_change"]),
+            )
+        )
+        sources = {key.removeprefix(_PART): part for key, part in kept.items() if key.startswith(_PART)}
+        known = Known(covariance=kept["covariance"], by_source=sources) if "covariance" in kept else None
+        return _Found(time_functions=functions, coefficients=kept["coefficients"], known=known)
+
+    def equations_at(self, basis: SectionBasis, amplitude: Floats) -> Equations:
+        """Return the equations of scale 1 at amplitudes: the last pass, unless that was in an earlier run."""
+        if self._last is not None and np.array_equal(self._last[0], amplitude):
             return self._last[1]
-        amplitude = np.einsum("ft,fjk->tjk", self._time_functions, coefficients)
         return linearise(self._prepared[1].images, basis, amplitude, progress=self._progress, task="last pass")
 
-    def _solved(self, name: str, basis: SectionBasis, stage: ResolvedStage, start: Floats, to_noise: bool) -> Solution:
+    def noise(self, equations: Equations) -> Noise:
+        """Return the noise of all images at scale 1; where the detector's is not stated, what the residual tells."""
+        fine = self._prepared[1]
+        return noise_of(self._setup, fine) or known_from_residual(
+            equations.rms, fine.systematic.shape, fine.systematic.detector, self._setup.options.smooth_px
+        )
+
+    def _solved(
+        self, name: str, basis: SectionBasis, stage: ResolvedStage, functions: Floats, start: Floats, to_noise: bool
+    ) -> Solution:
         prepared, passes = self._prepared[stage.scale], 0
 
         def at(amplitude: Floats) -> Equations:
@@ -219,22 +234,48 @@ class _Protocol:
             task = f"{name}, scale {stage.scale}, pass {passes}"
             return linearise(prepared.images, basis, amplitude, progress=self._progress, task=task)
 
+        def noise_at(amplitude: Floats, equations: Equations, slow: Floats) -> Propagated:
+            noise = self.noise(equations)
+            images, systematic = prepared.images, prepared.systematic
+            return propagate(images, systematic, basis, amplitude, slow, noise, progress=self._progress)
+
         solution = stage.solver.solve(
             Problem(
                 linearise=at,
-                time_functions=self._time_functions,
+                basis=basis,
+                series=self._setup.experiment.test,
+                time_functions=functions,
                 start=start,
                 prior=self._setup.prior(basis),
                 # as long as the sample only moves as a whole, what is left is not noise
                 noise_rms=prepared.noise_rms if to_noise else None,
+                noise_at=noise_at if stage.scale == 1 and to_noise else None,
             )
         )
-        self._last = (solution.coefficients, solution.equations)
+        self._last = (np.einsum("ft,fjk->tjk", functions, solution.coefficients), solution.equations)
         return solution
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """What a stage found."""
+
+    time_functions: Floats
+    coefficients: Floats
+    """(function, section, motion), voxels."""
+    known: Known | None
+    """How well it is known, where its solver tells."""
+
+
+_PART = "part of the covariance: "
+
+
 def _packed(solution: Solution) -> dict[str, NDArray[Any]]:
+    known = {} if solution.known is None else {"covariance": solution.known.covariance}
+    parts = {} if solution.known is None else solution.known.by_source
     return {
+        **known,
+        **{_PART + name: part for name, part in parts.items()},
         "coefficients": solution.coefficients,
         "temporal": solution.temporal,
         "spatial": solution.spatial,

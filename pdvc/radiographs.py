@@ -166,6 +166,19 @@ def smoothed(image: Image, smooth_px: float) -> Image:
     return image if smooth_px == 0 else np.asarray(ndimage.gaussian_filter(image, smooth_px, mode="nearest"))
 
 
+def sharpened(image: Image) -> Image:
+    """Return a view (row, column) sharpened by what interpolation blurs between it and its re-projection.
+
+    Back-projecting interpolates linearly between pixels, projecting does between voxels: each multiplies a wave of k
+    cycles per pixel by sinc(k)^2. Both together are undone by the inverse of the cubic B-spline's samples,
+
+        sinc(k)^4 is about (4 + 2 cos(2 pi k)) / 6        0.66 and 0.67 at k = 1/4
+
+    along rows and columns: at most three times the amplitude, at k = 1/2 along an axis.
+    """
+    return np.asarray(ndimage.spline_filter(image, order=3, output=np.float32, mode="nearest"))
+
+
 def noise_overlap(smooth_px: float) -> Floats:
     """Return the covariance (lag,) of filtered white noise, along one axis, of a pixel with those 0, 1, 2 ... further.
 

@@ -21,7 +21,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from pdvc.geometry import ConeBeam
+from pdvc.geometry import ConeBeam, gaps_rad
 from pdvc.progress import Progress, silent
 from pdvc.rays import directions
 from pdvc.volume import Grid, Hull, framed
@@ -72,11 +72,6 @@ def fdk(
         )
         progress(task, batch.stop, len(angle_rad))
     return framed(np.ascontiguousarray(result.transpose(2, 0, 1)))
-
-
-def gaps_rad(turned_rad: Floats) -> Floats:
-    """Return the gaps (angle,) from each of the increasing angles of a turn to the next, over the turn's end too."""
-    return np.diff(np.append(turned_rad, turned_rad[0] + 2 * np.pi))
 
 
 def angular_share(angle_rad: Floats) -> Floats:

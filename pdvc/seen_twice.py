@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from pdvc.experiment import Series
-from pdvc.geometry import ConeBeam
+from pdvc.geometry import ConeBeam, gaps_rad
 from pdvc.radiographs import Calibration, binned, grey_levels
-from pdvc.reconstruction import gaps_rad
 
 Floats = NDArray[np.float64]
 

@@ -9,11 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.equations import Equations, Linearise
+from pdvc.experiment import Series
+from pdvc.noise import Propagated
 from pdvc.prior import Prior
+from pdvc.sections import SectionBasis
 from pdvc.settings import Choice
 from pdvc.verdict import Stop
 
 Floats = NDArray[np.float64]
+
+
+NoiseAt = Callable[[Floats, Equations, Floats], Propagated]
+"""From amplitudes (step, section, motion), the equations there, and time functions (function, step), to noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,6 +28,9 @@ class Problem:
     """A motion to be found in radiographs of one scale."""
 
     linearise: Linearise
+    basis: SectionBasis
+    series: Series
+    """What was recorded with the radiographs."""
     time_functions: Floats
     """Orthonormal (function, step)."""
     start: Floats
@@ -28,10 +38,16 @@ class Problem:
     prior: Prior
     noise_rms: float | None
     """gamma_f, the rms noise of the radiographs, grey levels; None where it is unknown or says nothing yet."""
+    noise_at: NoiseAt | None = None
+    """What the noise of all images does to the equations; None at coarse scales."""
 
 
 class Solver(Choice):
     """A way to solve a stage, with how far it goes; TOML finds a further kind as soon as it is defined."""
+
+    def functions(self, time_functions: Floats) -> Floats:
+        """Return the orthonormal functions (function, step) of its solution, by default those of the options."""
+        return time_functions
 
     def solve(self, problem: Problem) -> Solution:
         """Return the motion that solves a problem, or comes as near as the solver goes."""
@@ -61,6 +77,19 @@ class Solution:
     stop_reason: str
     last_change_voxel: float = float("nan")
     """Rms displacement of the last change, in the part that it moved most; NaN for a solver by modes."""
+    known: Known | None = None
+    """How well it is known, where the solver tells."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """How well each step's amplitudes are known."""
+
+    covariance: Floats
+    """C (function * unknown, function * unknown), voxel^2, with unknown = section * motion; or (function, unknown,
+    unknown), where each step has a function of its own and nothing joins them."""
+    by_source: dict[str, Floats]
+    """What each part of the noise, and the prior, add to C; empty where nothing joins the functions."""
 
 
 def evaluated(linearise: Linearise, time_functions: Floats, shape: tuple[int, ...]) -> Callable[[Floats], Equations]:

@@ -4,23 +4,38 @@ Reconstructing from few, noisy, cone-beam views and projecting again misses part
 
     e(r, theta) = P_theta[F](r) - f(r, theta)        with f the reference view,
 
-the same part for a test radiograph g at the same angle, where the sample has moved little. So it is moved with
-the sample and subtracted from the residual (section 4.1): a pixel's e is taken where the point of its ray that is
-nearest to the axis was before it moved, projected at the same angle. Between reference angles e is interpolated.
+the same part for a test radiograph g that looks through the sample in the same direction. So it is moved with the
+sample and subtracted from the residual (section 4.1). Two things move:
+
+- the direction. The source S(theta) of a step, moved back with the sample, is at S - u(S): a sample that moved across
+  the beam by u, or turned, is seen as at rest from the stage angle theta + delta, with delta about u / |S|, a view's
+  spacing for a dozen voxels. Where a face lies along the beam, e changes within the angle by which a face as long
+  as the section is turned by half a pixel. It is a mean over the views around theta + delta that is not wider
+  (`views_around`), which leaves the less of the views' noise the closer they are;
+- the place. A pixel's e is taken where the point of its ray that is nearest to the axis was before it moved,
+  projected at that angle.
+
+e has edges of a pixel or two, ten times above its noise, so that it is interpolated by Keys' cubic convolution on
+4 x 4 pixels (R. G. Keys, IEEE Trans. ASSP 29 (1981) 1153-1160).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from pdvc.geometry import gaps_rad
 from pdvc.sections import SectionBasis
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
+
+REACH = 3.0
+"""Standard deviations from which on a view takes no part in a mean over views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,21 +66,78 @@ def neighbouring_views(reference_rad: Floats, test_rad: Floats) -> Neighbours:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Systematic:
-    """e at the reference views that the steps need."""
+class Sight:
+    """The directions in which steps look through the sample as it was at rest, and the views that show it so."""
 
-    fields: Image
-    """e (field, row, column), grey levels, over the whole detector; zero where the volume does not reach."""
-    first: NDArray[np.int64]
-    """Index into `fields` of the view before each step's angle (step,)."""
-    second: NDArray[np.int64]
-    """Index into `fields` of the view after it (step,)."""
+    delta_rad: Floats
+    """delta (step,): what is added to the stage angle."""
+    views: NDArray[np.int64]
+    """The reference views around each direction (step, neighbour)."""
     share: Floats
-    """Share of the second (step,)."""
+    """Share of each (step, neighbour); of a step they add up to one, and may be zero."""
+
+    def of_step(self, step: int) -> dict[int, float]:
+        """Return the views that take part in a step, each with its share."""
+        found: dict[int, float] = {}
+        for view, share in zip(self.views[step].tolist(), self.share[step].tolist(), strict=True):
+            if share > 0:
+                found[view] = found.get(view, 0.0) + share
+        return found
+
+
+def views_around(view_rad: Floats, direction_rad: Floats, width_rad: float) -> tuple[NDArray[np.int64], Floats]:
+    """Return the views around each direction and their shares, (direction, neighbour) both.
+
+    The shares are a Gaussian of the angle between, of standard deviation `width_rad`, or half the views' spacing
+    where that is more; each view counts by the part of the turn that it stands for.
+    """
+    order = np.argsort(np.mod(view_rad, 2 * np.pi), kind="stable")
+    ring = np.mod(view_rad, 2 * np.pi)[order]
+    gaps = gaps_rad(ring)
+    width = max(width_rad, float(np.median(gaps)) / 2)
+    count = min(2 * int(np.ceil(REACH * width / float(np.median(gaps)))) + 2, len(ring))
+    at = np.mod(direction_rad, 2 * np.pi)
+    # the views from half of them before to half of them after
+    places = (np.searchsorted(ring, at)[:, None] + np.arange(count) - count // 2) % len(ring)
+    away = np.mod(ring[places] - at[:, None] + np.pi, 2 * np.pi) - np.pi
+    # where views are far apart the nearest counts, however far it is
+    nearest = np.abs(away).min(axis=1, keepdims=True)
+    part = (gaps + np.roll(gaps, 1))[places]
+    share = part * np.exp((nearest**2 - away**2) / (2 * width**2))
+    share[np.abs(away) > np.maximum(REACH * width, nearest)] = 0
+    return order[places], share / share.sum(axis=1, keepdims=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Systematic:
+    """e of the reference views, and what it takes to move it with the sample."""
+
+    left: Callable[[int], Image]
+    """e (row, column), grey levels, of a reference view, over the whole detector; zero where the volume does not
+    reach. Asked for again and again, and only of the views that steps look along."""
+    view_rad: Floats
+    """Stage angle of each reference view (view,)."""
+    step_rad: Floats
+    """Stage angle of each step (step,)."""
     corner: tuple[int, int]
     """First row and column of the used window on the whole detector."""
     shape: tuple[int, int]
     """Rows and columns of the used window."""
+    detector: tuple[int, int]
+    """Rows and columns of the whole detector."""
+    width_rad: float
+    """Standard deviation of the mean over views, rad."""
+
+    def looked_along(
+        self, steps: slice, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float
+    ) -> Sight:
+        """Return the directions in which a range of steps looks through the sample as it was at rest.
+
+        `rays` (step, 4, 3), mm, and `amplitude` (step, section, motion) in voxels of `voxel_mm`, of the range.
+        """
+        delta = turned_rad(rays, basis, amplitude, voxel_mm)
+        views, share = views_around(self.view_rad, self.step_rad[steps] + delta, self.width_rad)
+        return Sight(delta_rad=delta, views=views, share=share)
 
     def registered(self, steps: slice, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Image:
         """Return e (step, row, column) over the window, for a range of steps, moved with the sample.
@@ -76,11 +148,15 @@ class Systematic:
         result = np.empty((len(rays), *self.shape), dtype=np.float32)
         maps = basis.affine(amplitude) * voxel_mm
         corner = np.array(self.corner, dtype=np.int64)
-        chosen = self.first[steps], self.second[steps], self.share[steps]
-        _register(self.fields, *chosen, rays, basis.height_mm, maps, corner, result)
+        sight = self.looked_along(steps, rays, basis, amplitude, voxel_mm)
+        for t, one in enumerate(result):
+            field = np.zeros(self.detector, dtype=np.float32)
+            for view, share in sight.of_step(t).items():
+                field += np.float32(share) * self.left(view)
+            _register(field, rays[t], float(sight.delta_rad[t]), basis.height_mm, maps[t], corner, one)
         return result
 
-    def places(self, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Floats:
+    def places(self, step: int, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Floats:
         """Return where e is taken for each pixel of one step: (row, column, 2), row and column on the detector.
 
         `rays` (4, 3) of the window, mm; `amplitude` (section, motion) in voxels of `voxel_mm`.
@@ -88,6 +164,7 @@ class Systematic:
         result = np.empty((*self.shape, 2))
         _find_places(
             rays,
+            float(turned_rad(rays[None], basis, amplitude[None], voxel_mm)[0]),
             basis.height_mm,
             basis.affine(amplitude) * voxel_mm,
             np.array(self.corner, dtype=np.int64),
@@ -96,16 +173,62 @@ class Systematic:
         return result
 
 
+def turned_rad(rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Floats:
+    """Return delta (step,), rad: the stage angle from which each step sees the sample as at rest, less its own.
+
+    `rays` (step, 4, 3), mm; `amplitude` (step, section, motion) in voxels of `voxel_mm`. The motion at mid height,
+    z = 0, counts, affine as far as the source: with S' = S - u(S), tan(delta) = -(S x S') / (S . S'), as the beam
+    turns against the stage in the frame of the sample.
+    """
+    source = rays[:, 0]
+    weight = basis.weights(0.0)
+    maps = np.einsum("j,tjab->tab", weight, basis.affine(amplitude)) * voxel_mm
+    before = source - np.einsum("tab,tb->ta", maps[..., :3], source) - maps[..., 3]
+    cross = source[:, 0] * before[:, 1] - source[:, 1] * before[:, 0]
+    along = source[:, 0] * before[:, 0] + source[:, 1] * before[:, 1]
+    return np.asarray(-np.arctan2(cross, along))
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
-def _bilinear(field, r, c):  # type: ignore[no-untyped-def]
-    """Interpolate between pixels; zero outside the detector."""
-    if r < -0.01 or r > field.shape[0] - 0.99 or c < -0.01 or c > field.shape[1] - 0.99:
+def keys_weights(x):  # type: ignore[no-untyped-def]
+    """Return the weights of the pixels before, at, after and two after a place, x in [0, 1] beyond `at`."""
+    return (
+        ((-0.5 * x + 1.0) * x - 0.5) * x,
+        (1.5 * x - 2.5) * x * x + 1.0,
+        ((-1.5 * x + 2.0) * x + 0.5) * x,
+        (0.5 * x - 0.5) * x * x,
+    )
+
+
+def taps(place: Floats, first: NDArray[np.int64]) -> Floats:
+    """Return the weights (4, ...) of the four pixels about places (...,), from the pixel before `first` on."""
+    return np.stack(keys_weights.py_func(place - first))  # type: ignore[no-untyped-call]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def first_pixel(place, count):  # type: ignore[no-untyped-def]
+    """Return the pixel at or before a place along an axis of `count` pixels; -1 where the place is off it."""
+    if place < -0.01 or place > count - 0.99:
+        return -1
+    return min(max(int(place), 0), count - 2)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _cubic(field, r, c):  # type: ignore[no-untyped-def]
+    """Interpolate between pixels, those of the edge repeated beyond it; zero off the detector."""
+    rows, columns = field.shape
+    i, j = first_pixel(r, rows), first_pixel(c, columns)
+    if i < 0 or j < 0:
         return 0.0
-    i, j = min(max(int(r), 0), field.shape[0] - 2), min(max(int(c), 0), field.shape[1] - 2)
-    fr, fc = r - i, c - j
-    upper = (1 - fc) * field[i, j] + fc * field[i, j + 1]
-    lower = (1 - fc) * field[i + 1, j] + fc * field[i + 1, j + 1]
-    return (1 - fr) * upper + fr * lower
+    down, right = keys_weights(r - i), keys_weights(c - j)
+    total = 0.0
+    for m in range(4):
+        row = min(max(i - 1 + m, 0), rows - 1)
+        line = 0.0
+        for n in range(4):
+            line += right[n] * field[row, min(max(j - 1 + n, 0), columns - 1)]
+        total += down[m] * line
+    return total
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -115,7 +238,7 @@ def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _place(rays, normal, depth, pitch2, heights, maps, corner, row, column):  # type: ignore[no-untyped-def]
+def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column):  # type: ignore[no-untyped-def]
     """Return the row and the column, on the whole detector, where a pixel's material was seen before it moved."""
     n = len(heights)
     sx, sy, sz = rays[0]
@@ -137,7 +260,10 @@ def _place(rays, normal, depth, pitch2, heights, maps, corner, row, column):  # 
         ux += s * (_moved(m, 0, x, y, z) - ux)
         uy += s * (_moved(m, 1, x, y, z) - uy)
         uz += s * (_moved(m, 2, x, y, z) - uz)
-    x, y, z = x - ux - sx, y - uy - sy, z - uz - sz
+    # seen from stage angle theta + delta: turned by delta, it is seen alike from theta
+    x, y, z = x - ux, y - uy, z - uz
+    cos, sin = turn
+    x, y, z = cos * x - sin * y - sx, sin * x + cos * y - sy, z - sz
     scale = depth / (x * normal[0] + y * normal[1] + z * normal[2])
     x, y, z = sx + scale * x - ox, sy + scale * y - oy, sz + scale * z - oz
     return (x * dx + y * dy + z * dz) / pitch2 + corner[0], (x * rx + y * ry + z * rz) / pitch2 + corner[1]
@@ -154,24 +280,21 @@ def _panel(rays):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, parallel=True, error_model="numpy")
-def _register(fields, first, second, share, rays, heights, maps, corner, out):  # type: ignore[no-untyped-def]
-    """Sample the fields where each pixel's material was before it moved."""
-    rows = out.shape[1]
-    for task in prange(len(out) * rows):
-        t, row = task // rows, task % rows
-        normal, depth, pitch2 = _panel(rays[t])
-        for column in range(out.shape[2]):
-            r, c = _place(rays[t], normal, depth, pitch2, heights, maps[t], corner, row, column)
-            value = _bilinear(fields[first[t]], r, c)
-            if share[t] > 0:
-                value += share[t] * (_bilinear(fields[second[t]], r, c) - value)
-            out[t, row, column] = value
+def _register(field, rays, delta, heights, maps, corner, out):  # type: ignore[no-untyped-def]
+    """Sample a step's field where each pixel's material was before it moved."""
+    normal, depth, pitch2 = _panel(rays)
+    turn = np.cos(delta), np.sin(delta)
+    for row in prange(out.shape[0]):
+        for column in range(out.shape[1]):
+            r, c = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)
+            out[row, column] = _cubic(field, r, c)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _find_places(rays, heights, maps, corner, out):  # type: ignore[no-untyped-def]
+def _find_places(rays, delta, heights, maps, corner, out):  # type: ignore[no-untyped-def]
     """Write the places of all pixels of one step."""
     normal, depth, pitch2 = _panel(rays)
+    turn = np.cos(delta), np.sin(delta)
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
-            out[row, column] = _place(rays, normal, depth, pitch2, heights, maps, corner, row, column)
+            out[row, column] = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)

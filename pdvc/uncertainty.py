@@ -1,6 +1,6 @@
 """Covariance of the amplitudes, and what the data determine.
 
-At the solution, with H the Hessian of all unknowns (gauss_newton.hessian), V the covariance of its right-hand side
+At the solution, with H the Hessian of all unknowns (equations.joined), V the covariance of its right-hand side
 (`pdvc.noise`), gamma the rms residual and P the prior's precision, an error of the amplitudes is
 (H + gamma^2 P)^-1 times what noise does to the right-hand side, and what the prior pulls there. Their covariance is
 
@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.deviations import step_covariance
-from pdvc.equations import Equations
-from pdvc.gauss_newton import hessian
+from pdvc.equations import Equations, joined
 from pdvc.noise import separate
 from pdvc.prior import LEAST_RMS, Prior, solved
+from pdvc.solution import Known
 
 Floats = NDArray[np.float64]
 
@@ -32,14 +32,9 @@ UNSEEN = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Posterior:
-    """How well each step's amplitudes are known."""
+class Posterior(Known):
+    """How well each step's amplitudes are known, and what is said of each."""
 
-    covariance: Floats
-    """C (function * unknown, function * unknown), voxel^2, with unknown = section * motion; or (function, unknown,
-    unknown), where each step has a function of its own and nothing joins them."""
-    by_source: dict[str, Floats]
-    """What each part of the noise, and the prior, add to C; empty where nothing joins the functions."""
     deviation: Floats
     """Standard deviations (step, section, motion), voxels."""
     data_share: Floats
@@ -55,8 +50,6 @@ def posterior(
 
     `noise` are the parts of V (noise.Propagated.parts); without it residuals are taken as white, of the observed size.
     """
-    shape = prior.deviation_voxel.shape
-    steps = time_functions.shape[1]
     precision = prior.precision()
     by_source: dict[str, Floats] = {}
     if separate(time_functions):
@@ -68,7 +61,7 @@ def posterior(
             ]
         )
     else:
-        matrix, gamma2 = hessian(equations.matrix, time_functions), max(equations.rms, LEAST_RMS) ** 2
+        matrix, gamma2 = joined(equations.matrix, time_functions), max(equations.rms, LEAST_RMS) ** 2
         ridge = np.tile(prior.ridge(equations.rms), len(time_functions))
         inverse = solved(matrix + np.diag(ridge), np.eye(len(matrix)))
         for name, part in ({"residual": gamma2 * matrix} if noise is None else noise).items():
@@ -76,12 +69,19 @@ def posterior(
             by_source[name] = (whole + whole.T) / 2
         by_source["prior"] = (inverse * (gamma2 * ridge)) @ inverse
         covariance = np.sum(list(by_source.values()), axis=0)
-    variance = np.stack([np.diag(step_covariance(covariance, time_functions, t)) for t in range(steps)])
-    before = (time_functions**2).sum(axis=0)[:, None] / precision
+    return stated(Known(covariance=covariance, by_source=by_source), equations, time_functions, prior)
+
+
+def stated(known: Known, equations: Equations, time_functions: Floats, prior: Prior) -> Posterior:
+    """Return what is said of each amplitude, from the covariance of all."""
+    shape = prior.deviation_voxel.shape
+    steps = time_functions.shape[1]
+    variance = np.stack([np.diag(step_covariance(known.covariance, time_functions, t)) for t in range(steps)])
+    before = (time_functions**2).sum(axis=0)[:, None] / prior.precision()
     information = np.einsum("tnn->n", equations.matrix).reshape(shape).sum(axis=1)
     return Posterior(
-        covariance=covariance,
-        by_source=by_source,
+        covariance=known.covariance,
+        by_source=known.by_source,
         deviation=np.sqrt(np.maximum(variance, 0)).reshape(steps, *shape),
         data_share=np.clip(1 - variance / before, 0, 1).reshape(steps, *shape),
         observed=information > UNSEEN * np.median(information),

@@ -41,7 +41,7 @@ from pdvc.experiment import Experiment, InterruptedScan
 from pdvc.history import Steps, time_basis
 from pdvc.measurement import MeasuredMotion, Measurement, Provenance, Stage, unfitted
 from pdvc.options import MeasureOptions, check_discarded, coarse_scale
-from pdvc.preparation import reference_volume, scan_volume
+from pdvc.preparation import Care, reference_volume, scan_volume
 from pdvc.prior import LEAST_RMS, Prior
 from pdvc.progress import Progress, silent
 from pdvc.protocol import versions
@@ -89,7 +89,7 @@ def correlate(
     started = time.perf_counter()
     # volumes are filtered here, not the radiographs
     examined = usable(experiment, progress=progress)
-    options = options.model_copy(update={"smooth_px": 0.0})
+    options = options.model_copy(update={"smooth_px": 0.0, "sharpen": False})
     setup = set_up(experiment, options, work=work, progress=progress)
     stages = _stages_of(setup)
 
@@ -187,7 +187,7 @@ def _pairs(
 
     def pair(scale: int) -> VolumePair:
         keep = partial(setup.store.arrays, "volume", (scan.step, scale, calibration, outline.hull))
-        volume = scan_volume(series, setup.geometry, calibration, outline.hull, scale, 0.0, keep, progress)
+        volume = scan_volume(series, setup.geometry, calibration, outline.hull, scale, Care(), keep, progress)
         return VolumePair(
             reference=references[scale],
             deformed=smoothed(volume, SMOOTHING_VOXEL),

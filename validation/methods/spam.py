@@ -34,7 +34,7 @@ from pdvc.experiment import Experiment
 from pdvc.history import Steps, time_basis
 from pdvc.measurement import MeasuredMotion, Measurement, Provenance, Stage, unfitted
 from pdvc.options import MeasureOptions
-from pdvc.preparation import scan_volume
+from pdvc.preparation import Care, scan_volume
 from pdvc.prior import solved
 from pdvc.progress import silent
 from pdvc.protocol import versions
@@ -175,11 +175,11 @@ def _volumes(setup: Setup) -> tuple[Volume, list[Volume]]:
     experiment, geometry, calibration = setup.experiment, setup.geometry, setup.calibration
     plain, polynomial = calibration.with_polynomial(IDENTITY), calibration.polynomial
     hull = setup.outline.hull
-    reference = scan_volume(experiment.reference, geometry, calibration, hull, 1, 0.0, _made, silent)
+    reference = scan_volume(experiment.reference, geometry, calibration, hull, 1, Care(), _made, silent)
     volumes = []
     for scan in experiment.interrupted:
         hull = outlined(scan.series, geometry, plain, polynomial, _made, silent).hull
-        volumes.append(scan_volume(scan.series, geometry, calibration, hull, 1, 0.0, _made, silent))
+        volumes.append(scan_volume(scan.series, geometry, calibration, hull, 1, Care(), _made, silent))
     return reference, volumes
 
 

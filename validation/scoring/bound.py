@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.deviations import Knowledge, Quantities
-from pdvc.equations import Images, linearise
+from pdvc.equations import Images, joined, linearise
 from pdvc.experiment import Experiment, read_experiment
-from pdvc.gauss_newton import hessian
 from pdvc.noise import separate
 from pdvc.options import MeasureOptions
 from pdvc.preparation import prepare, stated_noise
@@ -108,7 +107,7 @@ def _inverse(
         first = [int(np.argmax(f != 0)) for f in time_functions]
         matrices = [f[t] ** 2 * equations.matrix[t] for t, f in zip(first, time_functions, strict=True)]
         return np.stack([solved(m + np.eye(size) / prior_voxel**2, np.eye(size)) for m in matrices])
-    matrix = hessian(equations.matrix, time_functions)
+    matrix = joined(equations.matrix, time_functions)
     return solved(matrix + np.eye(len(matrix)) / prior_voxel**2, np.eye(len(matrix)))
 
 
