@@ -95,7 +95,7 @@ def factored(matrix: Blocks) -> Factor:
             here = here - far[t - 2] @ far[t - 2].T
         lower = np.linalg.cholesky(here)
         log_determinant += 2 * float(np.log(np.diag(lower)).sum())
-        inverse[t] = np.linalg.inv(lower)
+        inverse[t] = _inverse_of_lower(lower)
         if t + 1 < steps:
             following = matrix.next[t]
             if t >= 1:
@@ -104,3 +104,19 @@ def factored(matrix: Blocks) -> Factor:
         if t + 2 < steps:
             far[t] = matrix.after[t] @ inverse[t].T
     return Factor(inverse=inverse, next=near, after=far, log_determinant=log_determinant)
+
+
+_LEAF = 24
+
+
+def _inverse_of_lower(lower: Floats) -> Floats:
+    """Return the inverse of a lower triangle, by halves: nearly all of it are products, which are fast."""
+    size = len(lower)
+    if size <= _LEAF:
+        return np.asarray(np.linalg.inv(lower))
+    half = size // 2
+    result = np.zeros_like(lower)
+    result[:half, :half] = _inverse_of_lower(lower[:half, :half])
+    result[half:, half:] = _inverse_of_lower(lower[half:, half:])
+    result[half:, :half] = -result[half:, half:] @ (lower[half:, :half] @ result[:half, :half])
+    return result

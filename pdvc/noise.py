@@ -11,12 +11,14 @@ all images. The noise of h = sum_t sigma(t) (x) S(t)^T W rho(t) has therefore th
     V = sum_t sigma sigma^T (x) S^T W V_g W S                                     radiographs
       + sum_v sum_tt' a_tv a_t'v sigma(t) sigma(t')^T (x) Y_t^T V_v Y_t'          reference views,  Y_t = R_t^T W S(t)
       + sum_p v_phi(p) z(p) z(p)^T                                                flats
+      + b^2 w w^T,          w = sum_t sigma(t) (x) S(t)^T W R_t e                 e itself
     z(p) = sum_t sigma(t) (x) [s_f(p) Y_t(p) - s_t(p) W S(t, p)]
 
 Filtering the radiographs first (`radiographs.smoothed`) puts G S for S here, where S meets noise: G S is taken as the
 sensitivity of the volume filtered once more, which is exact in a parallel beam.
 
-with a_tv the share of view v at step t: e is a mean over the views around the step's direction. The noise of the
+e is believed to a share b: what was left of the paths through the sample at rest is subtracted from others.
+a_tv is the share of view v at step t: e is a mean over the views around the step's direction. The noise of the
 reference volume itself moves with the sample: re-projected and subtracted again it cancels, and that of the reference
 views takes its place. Where e is not subtracted, the re-projected volume holds at most the same noise, so that V is
 then an upper bound.
@@ -44,6 +46,9 @@ Image = NDArray[np.float32]
 
 SOURCES = ("radiographs", "views", "flats")
 """Where noise comes from."""
+BELIEF = 0.05
+"""Share of e that it may be wrong by, alike everywhere: what re-projection leaves of paths a little other than those
+of the reference scan is known no better."""
 _BLOCK_ROWS = 16
 
 
@@ -101,6 +106,9 @@ class Propagated:
     unknown, unknown) where functions share no step."""
     own: Mapping[str, Floats]
     """The same of each step's c alone (step, unknown, unknown)."""
+    systematic: Floats
+    """What one standard deviation of the subtracted systematic residual does to c (step, unknown), at all steps alike;
+    zero where none is subtracted."""
 
     @property
     def covariance(self) -> Floats:
@@ -129,6 +137,7 @@ def propagate(
     unknowns = basis.shape[0] * basis.shape[1]
     own = {name: np.empty((len(amplitude), unknowns, unknowns)) for name in SOURCES}
     pairs: dict[tuple[int, int], Floats] = {}
+    believed = np.zeros((len(amplitude), unknowns))
     pile = None if apart else Pile(noise.flat.shape, time_functions, basis.shape[1])
     sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
     held: dict[int, Sensitivities] = {}
@@ -142,6 +151,10 @@ def propagate(
         view = _mean(noise, sight.of_step(t))
         own["radiographs"][t] = product(weighted, weighted, image.variance, unknowns)
         own["views"][t] = product(moved, moved, view.variance, unknowns)
+        if images.systematic is not None:
+            one = slice(t, t + 1)
+            left = systematic.registered(one, images.rays[one], basis, amplitude[one], images.voxel_mm)[0]
+            believed[t] = BELIEF * adjoint(weighted, left, unknowns)
         both = [(moved, view.slope, (0, 0)), (weighted, -image.slope, systematic.corner)]
         shared = overlaid(both, noise.flat.shape)
         own["flats"][t] = product(shared, shared, noise.flat, unknowns)
@@ -163,7 +176,9 @@ def propagate(
         "views": _joined(own["views"], pairs, time_functions),
         "flats": _joined(own["flats"], {}, time_functions) if pile is None else pile.covariance(noise.flat, unknowns),
     }
-    return Propagated(parts=joint, own=own)
+    common = time_functions @ believed
+    joint["systematic"] = common[:, :, None] * common[:, None] if apart else np.outer(common.ravel(), common.ravel())
+    return Propagated(parts=joint, own=own, systematic=believed)
 
 
 def residual_tests(
@@ -235,6 +250,16 @@ def product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns:
     offsets = one.first * one.motions, other.first * other.motions
     _add_product(one.values, offsets[0], other.values, offsets[1], variance, result)
     return result
+
+
+def adjoint(field: Sensitivities, image: Image, unknowns: int) -> Floats:
+    """Return sum_p field(p) image(p), (unknown,)."""
+    of_rows = np.einsum("rck,rc->rk", field.values, image, dtype=float)
+    # the last sections may have room beyond
+    found = np.zeros(unknowns + field.values.shape[2])
+    for first, row in zip(field.first * field.motions, of_rows, strict=True):
+        found[first : first + len(row)] += row
+    return found[:unknowns]
 
 
 def _joined(own: Floats, pairs: Mapping[tuple[int, int], Floats], time_functions: Floats) -> Floats:

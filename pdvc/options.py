@@ -80,7 +80,7 @@ class MeasureOptions(Settings):
     """rows left out at the top and at the bottom, px; default: 100 of 954, or more where rays need it"""
     discard_columns: Annotated[int, Field(ge=0)] | None = None
     """columns left out on the left and on the right, px; default: 60 of 432, or less for a wide sample"""
-    sections: Annotated[int, Field(ge=2)] = 15
+    sections: Annotated[int, Field(ge=2)] = 21
     """sections, equally spaced over the used height"""
     section_motions: tuple[str, ...] = names_of((*RIGID, CONTRACTION))
     """motions of a section: six rigid ones, and contraction"""
@@ -183,6 +183,7 @@ def check_discarded(options: MeasureOptions, geometry: ConeBeam) -> None:
 def paper_options() -> MeasureOptions:
     """Return the paper's protocol: Table 1, six motions a section, eight modes at scale 2, four at scale 1."""
     return MeasureOptions(
+        sections=15,
         section_motions=names_of(RIGID),
         time=PAPER,
         smooth_px=0.0,

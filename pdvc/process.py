@@ -48,15 +48,15 @@ from pdvc.sections import CONTRACTION, RIGID, TRANSLATION_Z, SectionBasis
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-MODES = 16
-"""Modes along z of each motion, at most: a wave of a ninth of the height is still followed."""
+FITTED_MODES = 8
+"""Modes along z of each motion, at most, when deviations are found: how they fall off tells of all others."""
 FREEDOM = 4.0
 """Degrees of freedom of Student's distribution of bends, and of the radiographs' misfit."""
 LONGEST_GAP = 4.0
 """Gap between steps, in median gaps, beyond which the sample is held rather than moved."""
 ROUNDS = 3
 """Times that deviations and scales are found in turn."""
-EVALUATIONS = 14
+EVALUATIONS = 10
 """Of the marginal likelihood in each round."""
 TYPICAL_VOXEL = 0.01
 """Median of the broad prior of deviations q, voxels."""
@@ -112,15 +112,19 @@ class StateSpace:
         *,
         contraction_of_strain: float | None,
         prior_voxel: float,
+        most_modes: int | None = None,
     ) -> None:
-        """Set up for a section basis, times (step,), a trend (function, step), and nu; deviations in voxels."""
+        """Set up for a section basis, times (step,), a trend (function, step), and nu; deviations in voxels.
+
+        `most_modes` of each motion along z, the smoothest; None: as many as there are sections.
+        """
         sections, motions = basis.shape
         self.basis, self.prior_voxel = basis, prior_voxel
         single = replace(basis, height_mm=np.array([basis.height_mm.mean()]), motions=RIGID)
         followed = [k for k in range(len(RIGID)) if basis.reproduces(replace(single, motions=(RIGID[k],)))]
         each = [replace(single, motions=(RIGID[k],)) for k in followed]
         rigid = np.stack([basis.reproduced(np.ones((1, 1)), one).ravel() for one in each], axis=1)
-        modes, self._value = _modes(basis.height_mm)
+        modes, self._value = _modes(basis.height_mm, sections if most_modes is None else most_modes)
         own = np.einsum("jm,kl->jklm", modes, np.eye(motions)).reshape(sections * motions, -1)
         if contraction_of_strain and {CONTRACTION, TRANSLATION_Z} <= set(basis.motions):
             axial, contraction = basis.motions.index(TRANSLATION_Z), basis.motions.index(CONTRACTION)
@@ -302,16 +306,13 @@ class Process:
         p = smoothed.trend_covariance @ of_data
         return np.asarray(space.to_amplitude @ (found + (space.trend - smoothed.held) @ p))
 
-    def fitted(self, deviations: Deviations, rounds: int = ROUNDS) -> tuple[Deviations, Smoothed, Blocks]:
-        """Return deviations of the largest marginal likelihood, with the states and their covariance there."""
+    def fitted(self, deviations: Deviations, rounds: int = ROUNDS) -> Deviations:
+        """Return deviations of the largest marginal likelihood: q, e and r, and the scales, in turn."""
         for _ in range(rounds):
             deviations = self._likeliest(deviations)
             smoothed = self.smoothed(deviations)
             deviations = self._rescaled(deviations, smoothed, smoothed.factor.inverted())
-        if rounds:
-            deviations = self._likeliest(deviations)
-        smoothed = self.smoothed(deviations)
-        return deviations, smoothed, smoothed.factor.inverted()
+        return deviations
 
     def _squares(self, smoothed: Smoothed, inverse: Blocks) -> tuple[Floats, Floats]:
         """Return E[w^2] (step - 2, state), and E[x^2] of the ends (end, state)."""
@@ -385,12 +386,12 @@ def _expected(share: Floats) -> Floats:
     return np.asarray((FREEDOM + share.sum(axis=1)) / (FREEDOM + share.shape[1]))
 
 
-def _modes(height_mm: Floats) -> tuple[Floats, Floats]:
+def _modes(height_mm: Floats, most: int) -> tuple[Floats, Floats]:
     """Return modes along z (section, mode), each of norm sqrt(sections), and their eigenvalues, largest first."""
     span = max(float(np.ptp(height_mm)), 1e-9)
     away = np.sqrt(3) * np.abs(height_mm[:, None] - height_mm) / (span / 2)
     value, vector = linalg.eigh((1 + away) * np.exp(-away))
-    kept = np.argsort(value)[::-1][:MODES]
+    kept = np.argsort(value)[::-1][:most]
     return vector[:, kept] * np.sqrt(len(height_mm)), value[kept]
 
 

@@ -9,11 +9,13 @@ and `pdvc.process` finds the likeliest process and the amplitudes under all data
 
 The posterior covariance holds noise and what the process leaves open. Steps that look along the same views, and all
 steps by the flats, have noise in common, which V(t) of each step alone does not tell. What varies slowly of it counts:
-with few smooth functions Psi of the step, h = sum_i Psi_i(t) g_i, and
+motions in the span of a few smooth functions Psi of the step, on which all noise together has the covariance V_Psi
+and that of each step alone W_Psi = sum_t Psi Psi^T (x) V(t). With H = sum_t Psi Psi^T (x) B(t), what they differ by is
 
-    cov g = [ V_Psi - sum_t Psi(t) Psi(t)^T (x) V(t) ] / T^2           V_Psi: of all steps together, T steps
+    cov g = H^-1 (V_Psi - W_Psi) H^-1 = sum_k lambda_k v_k v_k^T,        (V_Psi - W_Psi) u = lambda H u,  v = u
 
-whose effect on the amplitudes is added. Both parts are split by the sources of noise with draws of them.
+of coefficients g, and each direction v_k does to the amplitudes what data y = X sum_i Psi_i v_ki would. Noise that
+cancels between steps has a negative lambda. Draws of the noise of each step tell what each source makes.
 """
 
 from __future__ import annotations
@@ -26,11 +28,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import linalg
 
-from pdvc.banded import Blocks
 from pdvc.equations import Equations, joined
 from pdvc.history import Angle, Polynomial, TimeFunction, time_basis
 from pdvc.noise import Propagated
-from pdvc.process import ROUNDS, Deviations, Process, Seen, Smoothed, StateSpace
+from pdvc.process import FITTED_MODES, ROUNDS, Deviations, Process, Seen, Smoothed, StateSpace
 from pdvc.solution import SHORTER, Known, Problem, Solution, Solver
 from pdvc.verdict import Stop, listed
 
@@ -44,8 +45,10 @@ SLOW_DEGREE = 4
 """Degree of the polynomials among the functions Psi."""
 DRAWS = 64
 """Draws of each source of noise that tell its part."""
-RANK = 250
+RANK = 300
 """Directions of noise common to steps that are followed, the largest."""
+WEAK = 1e-6
+"""Ridge of the metric, over its diagonal."""
 EVENT = 25.0
 """Scale of bends from which on a step is told as an event: five times the typical bend."""
 MISFIT = 2.0
@@ -59,7 +62,8 @@ class _Fit:
     process: Process
     deviations: Deviations
     smoothed: Smoothed
-    inverse: Blocks
+    white: Floats
+    """L^-1 (step, unknown, unknown)."""
 
     @property
     def amplitude(self) -> Floats:
@@ -97,22 +101,16 @@ class Smoother(Solver):
             raise ValueError("solver: expected kind = 'smoother' in the last stage, at scale 1, got it in another one")
         steps, shape = len(problem.series), problem.start.shape[1:]
         amplitude = problem.start.reshape(steps, -1) * np.sqrt(steps)
-        space = StateSpace(
-            problem.basis,
-            problem.series.time_s,
-            time_basis(self.trend, problem.series) if self.trend else np.empty((0, steps)),
-            contraction_of_strain=None if self.contraction_of_strain == "none" else self.contraction_of_strain,
-            prior_voxel=float(problem.prior.deviation_voxel.max()),
-        )
+        spaces = self._space(problem, FITTED_MODES), self._space(problem, None)
         equations = problem.linearise(amplitude.reshape(steps, *shape))
         slow = slow_functions(problem)
         noise = problem.noise_at(amplitude.reshape(steps, *shape), equations, slow)
         rms, last, stop, reason = [equations.rms], 0.0, Stop.MOST, f"{self.most_passes} passes done, the most allowed"
-        deviations, rounds = space.first_guess(), ROUNDS
+        deviations, rounds = spaces[0].first_guess(), ROUNDS
         if self.bend_voxel != "fit":
-            deviations, rounds = space.fixed(self.bend_voxel), 0
+            deviations, rounds = spaces[0].fixed(self.bend_voxel), 0
         for _ in range(self.most_passes):
-            fit, _ = _fitted(space, equations, noise, amplitude, deviations, rounds)
+            fit = _fitted(spaces, equations, noise, amplitude, deviations, rounds)
             deviations, rounds = fit.deviations, min(rounds, 1)
             moved, trial = self._carefully(problem, equations, amplitude, fit.amplitude)
             last = float(np.sqrt(np.mean((moved - amplitude) ** 2)))
@@ -121,7 +119,7 @@ class Smoother(Solver):
             if last < self.least_change_voxel:
                 stop, reason = Stop.CONVERGED, f"converged: the last change was {last:.2g} voxel rms"
                 break
-        fit, white = _fitted(space, equations, noise, amplitude, deviations, 0)
+        fit = _fitted(spaces, equations, noise, amplitude, deviations, 0)
         return Solution(
             coefficients=amplitude.reshape(steps, *shape) / np.sqrt(steps),
             equations=equations,
@@ -131,13 +129,25 @@ class Smoother(Solver):
             stop=stop,
             stop_reason=f"{reason}; {_in_words(fit.deviations)}",
             last_change_voxel=last,
-            known=_known(fit, noise, slow, white),
+            known=_known(fit, noise, slow, equations.matrix),
         )
 
     @property
     def passes(self) -> float:
         """Return about how many passes over all radiographs it may take."""
         return self.most_passes * 0.6 + 3
+
+    def _space(self, problem: Problem, most_modes: int | None) -> StateSpace:
+        """Return the states of a problem."""
+        steps = len(problem.series)
+        return StateSpace(
+            problem.basis,
+            problem.series.time_s,
+            time_basis(self.trend, problem.series) if self.trend else np.empty((0, steps)),
+            contraction_of_strain=None if self.contraction_of_strain == "none" else self.contraction_of_strain,
+            prior_voxel=float(problem.prior.deviation_voxel.max()),
+            most_modes=most_modes,
+        )
 
     def _carefully(
         self, problem: Problem, now: Equations, amplitude: Floats, wanted: Floats
@@ -177,13 +187,19 @@ def seen(equations: Equations, noise: Floats, amplitude: Floats) -> tuple[Seen, 
 
 
 def _fitted(
-    space: StateSpace, equations: Equations, noise: Propagated, amplitude: Floats, deviations: Deviations, rounds: int
-) -> tuple[_Fit, Floats]:
-    """Return the likeliest process about amplitudes (step, unknown), and L^-1."""
+    spaces: tuple[StateSpace, StateSpace],
+    equations: Equations,
+    noise: Propagated,
+    amplitude: Floats,
+    deviations: Deviations,
+    rounds: int,
+) -> _Fit:
+    """Return the likeliest process about amplitudes (step, unknown): found with few modes, then followed with all."""
     data, white = seen(equations, _of_all(noise), amplitude)
-    process = Process(space, data)
-    found, smoothed, inverse = process.fitted(deviations, rounds)
-    return _Fit(process=process, deviations=found, smoothed=smoothed, inverse=inverse), white
+    if rounds:
+        deviations = Process(spaces[0], data).fitted(deviations, rounds)
+    process = Process(spaces[1], data)
+    return _Fit(process=process, deviations=deviations, smoothed=process.smoothed(deviations), white=white)
 
 
 def _of_all(noise: Propagated) -> Floats:
@@ -191,28 +207,36 @@ def _of_all(noise: Propagated) -> Floats:
     return np.asarray(sum(noise.own.values()))
 
 
-def _known(fit: _Fit, noise: Propagated, slow: Floats, white: Floats) -> Known:
-    """Return the covariance of the amplitudes over the square root of the steps, and what makes it."""
-    process, steps = fit.process, len(white)
-    own = process.covariance(fit.smoothed, fit.inverse)
+def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
+    """Return the covariance of the amplitudes over the square root of the steps, and what makes it.
 
-    def effect(of_vector: Floats) -> Floats:
-        """Return the covariance that draws of h (step, unknown, draw), each worth one over their number, leave."""
-        moved = process.response(fit.smoothed, fit.deviations, white @ of_vector)
-        return np.asarray(moved @ moved.transpose(0, 2, 1))
+    `matrix` is B (step, unknown, unknown).
+    """
+    process, steps = fit.process, len(matrix)
+    own = process.covariance(fit.smoothed, fit.smoothed.factor.inverted())
+
+    def effect(errors: Floats, weight: Floats) -> Floats:
+        """Return the covariance left by errors of y (step, unknown, draw), each of a weight."""
+        moved = process.response(fit.smoothed, fit.deviations, errors)
+        return np.asarray((moved * weight) @ moved.transpose(0, 2, 1))
 
     rng = np.random.default_rng(0)
     parts = {}
     for name, covariance in noise.own.items():
-        draws = rng.standard_normal((*covariance.shape[:2], DRAWS)) / np.sqrt(DRAWS)
-        parts[name] = effect(_root(covariance) @ draws)
+        draws = rng.standard_normal((*covariance.shape[:2], DRAWS))
+        parts[name] = effect(fit.white @ (_root(covariance) @ draws), np.full(DRAWS, 1 / DRAWS))
     parts["process"] = own - np.sum(list(parts.values()), axis=0)
-    total = _of_all(noise)
-    for name in noise.own:
-        common = _common(noise.parts[name], joined(noise.own[name], slow), joined(total, slow))
-        if common is not None:
-            shared = np.einsum("ft,fnr->tnr", slow / steps, common.reshape(len(slow), -1, common.shape[1]))
-            left = effect(shared)
+    errors = np.einsum("tnm,tm->tn", fit.white, noise.systematic)[..., None]
+    parts["systematic"] = effect(errors, np.ones(1))
+    own = own + parts["systematic"]
+    metric = joined(matrix, slow)
+    for name, each in noise.own.items():
+        together = noise.parts[name]
+        # a single step has nothing in common with others
+        if together.ndim == metric.ndim:
+            weight, directions = _common(together - joined(each, slow), metric)
+            moved = np.einsum("ft,fnr->tnr", slow, directions.reshape(len(slow), -1, len(weight)))
+            left = effect(process.seen.design @ moved, weight)
             parts[name] = parts[name] + left
             own = own + left
     return Known(covariance=own / steps, by_source={name: part / steps for name, part in parts.items()})
@@ -224,21 +248,17 @@ def _root(covariance: Floats) -> Floats:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0))[:, None])
 
 
-def _common(whole: Floats, own: Floats, total: Floats) -> Floats | None:
-    """Return a root (function * unknown, direction) of the noise that steps have in common; None where there is none.
+def _common(difference: Floats, metric: Floats) -> tuple[Floats, Floats]:
+    """Return the largest lambda (direction,) of a difference in a metric, and their v (function * unknown, direction).
 
-    `whole`, of all steps together, less `own`, of each step, both on the functions Psi; `total` tells what counts.
-    Steps whose common noise cancels leave less than each its own: that is not taken off.
+    Motions that the radiographs hardly show are left to the process.
     """
-    if whole.ndim != own.ndim:
-        return None
-    scale = np.sqrt(np.maximum(np.diag(total), 1e-300))
-    values, vectors = linalg.eigh((whole - own) / scale[:, None] / scale)
-    kept = np.argsort(values)[::-1][:RANK]
-    kept = kept[values[kept] > RIDGE]
-    if len(kept) == 0:
-        return None
-    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]) * scale[:, None])
+    scale = 1 / np.sqrt(np.maximum(np.diag(metric), 1e-300))
+    scaled = metric * scale[:, None] * scale
+    scaled[np.diag_indices_from(scaled)] += WEAK
+    values, vectors = linalg.eigh(difference * scale[:, None] * scale, scaled)
+    kept = np.argsort(np.abs(values))[::-1][:RANK]
+    return values[kept], vectors[:, kept] * scale[:, None]
 
 
 def _in_words(deviations: Deviations) -> str:

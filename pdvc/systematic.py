@@ -238,8 +238,21 @@ def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def _stretch(m, x, y, z):  # type: ignore[no-untyped-def]
+    """Return by how much an affine map stretches along a unit vector."""
+    return (
+        x * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z)
+        + y * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z)
+        + z * (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z)
+    )
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column):  # type: ignore[no-untyped-def]
-    """Return the row and the column, on the whole detector, where a pixel's material was seen before it moved."""
+    """Return the row and the column, on the whole detector, where a pixel's material was seen before it moved.
+
+    And by how much it is stretched along the ray.
+    """
     n = len(heights)
     sx, sy, sz = rays[0]
     ox, oy, oz = rays[1]
@@ -249,24 +262,29 @@ def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column
     x, y, z = x - sx, y - sy, z - sz
     # the point of the ray that is nearest to the axis
     at = -(sx * x + sy * y) / (x * x + y * y)
+    length = np.sqrt(x * x + y * y + z * z)
+    bx, by, bz = x / length, y / length, z / length
     x, y, z = sx + at * x, sy + at * y, sz + at * z
     k = 0
     while k + 2 < n and heights[k + 1] < z:
         k += 1
     ux, uy, uz = _moved(maps[k], 0, x, y, z), _moved(maps[k], 1, x, y, z), _moved(maps[k], 2, x, y, z)
+    stretch = _stretch(maps[k], bx, by, bz)
     if n > 1:
         s = min(max((z - heights[k]) / (heights[k + 1] - heights[k]), 0.0), 1.0)
         m = maps[k + 1]
         ux += s * (_moved(m, 0, x, y, z) - ux)
         uy += s * (_moved(m, 1, x, y, z) - uy)
         uz += s * (_moved(m, 2, x, y, z) - uz)
+        stretch += s * (_stretch(m, bx, by, bz) - stretch)
     # seen from stage angle theta + delta: turned by delta, it is seen alike from theta
     x, y, z = x - ux, y - uy, z - uz
     cos, sin = turn
     x, y, z = cos * x - sin * y - sx, sin * x + cos * y - sy, z - sz
     scale = depth / (x * normal[0] + y * normal[1] + z * normal[2])
     x, y, z = sx + scale * x - ox, sy + scale * y - oy, sz + scale * z - oz
-    return (x * dx + y * dy + z * dz) / pitch2 + corner[0], (x * rx + y * ry + z * rz) / pitch2 + corner[1]
+    row, column = (x * dx + y * dy + z * dz) / pitch2 + corner[0], (x * rx + y * ry + z * rz) / pitch2 + corner[1]
+    return row, column, stretch
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -286,8 +304,8 @@ def _register(field, rays, delta, heights, maps, corner, out):  # type: ignore[n
     turn = np.cos(delta), np.sin(delta)
     for row in prange(out.shape[0]):
         for column in range(out.shape[1]):
-            r, c = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)
-            out[row, column] = _cubic(field, r, c)
+            r, c, stretch = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)
+            out[row, column] = (1 + stretch) * _cubic(field, r, c)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -297,4 +315,4 @@ def _find_places(rays, delta, heights, maps, corner, out):  # type: ignore[no-un
     turn = np.cos(delta), np.sin(delta)
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
-            out[row, column] = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)
+            out[row, column] = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)[:2]
