@@ -31,7 +31,7 @@ from scipy import linalg
 from pdvc.equations import Equations, joined
 from pdvc.history import Angle, Polynomial, TimeFunction, time_basis
 from pdvc.noise import Propagated
-from pdvc.process import FITTED_MODES, ROUNDS, Deviations, Process, Seen, Smoothed, StateSpace
+from pdvc.process import ASIDE, FITTED_MODES, ROUNDS, Deviations, Process, Seen, Smoothed, StateSpace
 from pdvc.solution import SHORTER, Known, Problem, Solution, Solver
 from pdvc.verdict import Stop, listed
 
@@ -51,8 +51,6 @@ WEAK = 1e-6
 """Ridge of the metric, over its diagonal."""
 EVENT = 25.0
 """Scale of bends from which on a step is told as an event: five times the typical bend."""
-MISFIT = 2.0
-"""Variance of a step's data over its noise from which on that is told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,7 +266,7 @@ def _in_words(deviations: Deviations) -> str:
     events = np.flatnonzero(np.maximum(deviations.rigid_scale, deviations.own_scale) > EVENT) + 1
     if len(events):
         said += f", far larger at step {listed(events.tolist())}"
-    misfits = np.flatnonzero(deviations.misfit > MISFIT)
+    misfits = np.flatnonzero(deviations.misfit > ASIDE)
     if len(misfits):
-        said += f"; radiographs that fit less well than their noise tells: step {listed(misfits.tolist())}"
+        said += f"; radiographs set aside, as they do not fit as their noise tells: step {listed(misfits.tolist())}"
     return said
