@@ -48,7 +48,7 @@ from pdvc.sections import CONTRACTION, RIGID, TRANSLATION_Z, SectionBasis
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-FITTED_MODES = 8
+FITTED_MODES = 12
 """Modes along z of each motion, at most, when deviations are found: how they fall off tells of all others."""
 FREEDOM = 4.0
 """Degrees of freedom of Student's distribution of bends, and of the radiographs' misfit."""

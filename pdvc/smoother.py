@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy import linalg
+from threadpoolctl import threadpool_limits
 
 from pdvc.equations import Equations, joined
 from pdvc.history import Angle, Polynomial, TimeFunction, time_basis
@@ -108,7 +109,8 @@ class Smoother(Solver):
         if self.bend_voxel != "fit":
             deviations, rounds = spaces[0].fixed(self.bend_voxel), 0
         for _ in range(self.most_passes):
-            fit = _fitted(spaces, equations, noise, amplitude, deviations, rounds)
+            with _one_thread():
+                fit = _fitted(spaces, equations, noise, amplitude, deviations, rounds)
             deviations, rounds = fit.deviations, min(rounds, 1)
             moved, trial = self._carefully(problem, equations, amplitude, fit.amplitude)
             last = float(np.sqrt(np.mean((moved - amplitude) ** 2)))
@@ -117,7 +119,9 @@ class Smoother(Solver):
             if last < self.least_change_voxel:
                 stop, reason = Stop.CONVERGED, f"converged: the last change was {last:.2g} voxel rms"
                 break
-        fit = _fitted(spaces, equations, noise, amplitude, deviations, 0)
+        with _one_thread():
+            fit = _fitted(spaces, equations, noise, amplitude, deviations, 0)
+            known = _known(fit, noise, slow, equations.matrix)
         return Solution(
             coefficients=amplitude.reshape(steps, *shape) / np.sqrt(steps),
             equations=equations,
@@ -127,7 +131,7 @@ class Smoother(Solver):
             stop=stop,
             stop_reason=f"{reason}; {_in_words(fit.deviations)}",
             last_change_voxel=last,
-            known=_known(fit, noise, slow, equations.matrix),
+            known=known,
         )
 
     @property
@@ -157,6 +161,11 @@ class Smoother(Solver):
             if trial.chi2.sum() <= now.chi2.sum() * (1 + WORSE):
                 break
         return moved, trial
+
+
+def _one_thread() -> threadpool_limits:
+    """Keep products of small matrices to one thread: two would wait for each other most of the time."""
+    return threadpool_limits(limits=1, user_api="blas")
 
 
 def slow_functions(problem: Problem) -> Floats:
