@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -219,6 +220,24 @@ def test_spreading_is_the_adjoint_of_registration(scanner, angle, seed, size, be
         return np.stack([share.get(view, 0.0) * spread for view in (0, 1)])
 
     dottest(forward, adjoint, (2, *whole), window, seed=seed)
+
+
+@law(25)
+@given(st.integers(0, 10**6), st.floats(0.0, 3.0))
+def test_fields_whose_rows_meet_different_sections_are_spread_section_by_section(seed, size):
+    """Each section's part of a field goes where a field of that section alone goes."""
+    rng, window, whole = np.random.default_rng(seed), (9, 7), (14, 12)
+    places = np.stack(np.indices(window) + 2.0, axis=-1) + size * rng.normal(size=(*window, 2))
+    field = Sensitivities(
+        values=rng.normal(size=(*window, 4)).astype(np.float32), first=rng.integers(0, 4, window[0]), motions=2
+    )
+    spread = _spread(field, places, whole)
+    assert (spread.first >= 0).all()
+    parts = dense(field, 10)
+    for k in range(10):
+        one = replace(field, values=parts[..., k : k + 1].astype(np.float32), first=0 * field.first, motions=1)
+        expected = dense(_spread(one, places, whole), 1)[..., 0]
+        np.testing.assert_allclose(dense(spread, 10)[..., k], expected, atol=1e-5)
 
 
 # Filters

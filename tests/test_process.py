@@ -320,14 +320,14 @@ def test_time_has_no_direction(seed, steps, section_motions):
 @given(seeds, lengths, motions, st.integers(0, 2))
 def test_steps_that_may_bend_without_limit_are_solved_each_by_itself(seed, steps, section_motions, trend):
     one = case(seed, steps, section_motions, trend=trend, tied=None)
-    free = replace(one.space.fixed(1e5), end_voxel=np.full(len(section_motions), 1e5), misfit=one.deviations.misfit)
+    free = replace(one.space.fixed(1e4), end_voxel=np.full(len(section_motions), 1e3), misfit=one.deviations.misfit)
     free = replace(free, roughness=np.zeros(len(section_motions)))
     mean, covariance, _ = solved(one, free)
     inverse = np.linalg.inv(one.seen.design)
     own = np.einsum("tnm,tm->tn", inverse, one.seen.data)
-    np.testing.assert_allclose(mean, own, atol=1e-4 * np.abs(own).max())
+    np.testing.assert_allclose(mean, own, atol=1e-3 * np.abs(own).max())
     spread = one.deviations.misfit[:, None, None] * (inverse @ inverse.transpose(0, 2, 1))
-    np.testing.assert_allclose(covariance, spread, atol=1e-4 * np.abs(spread).max())
+    np.testing.assert_allclose(covariance, spread, atol=1e-3 * np.abs(spread).max())
 
 
 @law(15)
