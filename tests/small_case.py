@@ -127,15 +127,20 @@ def stored(
 
 
 @cache
-def time_functions() -> Floats:
-    """Return four orthonormal time functions (function, step): sine and cosine of the angle, 1 and t."""
-    record = Series(
+def series() -> Series:
+    """Return what was recorded with the steps: their angles and times, and no force."""
+    return Series(
         counts=np.zeros((STEPS, 1, 1), dtype=np.uint16),
         angle_rad=ANGLES,
         time_s=np.arange(STEPS, dtype=float),
         force_N=np.zeros(STEPS),
     )
-    return time_basis((Angle(), Polynomial(degree=1)), record)
+
+
+@cache
+def time_functions() -> Floats:
+    """Return four orthonormal time functions (function, step): sine and cosine of the angle, 1 and t."""
+    return time_basis((Angle(), Polynomial(degree=1)), series())
 
 
 def radiographs(basis: SectionBasis, amplitude: Floats, volume: Volume | None = None) -> Images:

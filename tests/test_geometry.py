@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pdvc.geometry import ConeBeam
+from pdvc.geometry import ConeBeam, gaps_rad
 from pdvc.rays import directions, ray_vectors
 from tests.laws import law
 from validation.testing.strategies import angles_rad, cone_beams
@@ -118,3 +118,8 @@ def test_a_bin_larger_than_the_detector_is_refused(factor):
 def test_a_window_off_the_detector_is_refused(window):
     with pytest.raises(ValueError, match="window: expected a part of 60 x 44 px"):
         SCANNER.cropped(*window)
+
+
+def test_gaps_between_angles_go_on_over_the_turn_s_end():
+    np.testing.assert_allclose(gaps_rad(np.array([0.1, 0.5, 6.0])), [0.4, 5.5, 0.1 + 2 * np.pi - 6.0])
+    np.testing.assert_allclose(gaps_rad(np.array([1.0])), [2 * np.pi])

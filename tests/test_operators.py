@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -185,9 +186,9 @@ def test_shapes_are_the_adjoint_of_the_displacement(basis, seed):
     st.floats(-3.0, 3.0),
     st.integers(0, 99),
     st.floats(0.0, 9.0),
-    st.floats(0.0, 1.0),
+    st.floats(-3.0, 3.0),
 )
-def test_spreading_is_the_adjoint_of_registration(scanner, angle, seed, size, share):
+def test_spreading_is_the_adjoint_of_registration(scanner, angle, seed, size, beside):
     """Between two views, sections turned strongly, and, with large motions, from off the detector."""
     whole, corner = (scanner.rows, scanner.columns), (3, 5)
     used = scanner.cropped(3, scanner.rows - 4, 5, scanner.columns - 2)
@@ -196,26 +197,47 @@ def test_spreading_is_the_adjoint_of_registration(scanner, angle, seed, size, sh
 
     def systematic(fields: np.ndarray) -> Systematic:
         return Systematic(
-            fields=fields.astype(np.float32),
-            first=np.array([0]),
-            second=np.array([1]),
-            share=np.array([share]),
+            left=lambda view: fields[view].astype(np.float32),
+            view_rad=np.array([0.0, 2.0]),
+            step_rad=np.array([beside]),
             corner=corner,
             shape=window,
+            detector=whole,
+            width_rad=0.7,
         )
 
     def forward(fields: np.ndarray) -> np.ndarray:
         return systematic(fields).registered(slice(0, 1), rays, CLOSE, amplitude, VOXEL_MM)[0]
 
     def adjoint(image: np.ndarray) -> np.ndarray:
-        places = systematic(np.zeros((2, *whole))).places(rays[0], CLOSE, amplitude[0], VOXEL_MM)
+        still = systematic(np.zeros((2, *whole)))
+        places = still.places(0, rays[0], CLOSE, amplitude[0], VOXEL_MM)
+        share = still.looked_along(slice(0, 1), rays, CLOSE, amplitude, VOXEL_MM).of_step(0)
         field = Sensitivities(
             values=image[..., None].astype(np.float32), first=np.zeros(window[0], dtype=np.int64), motions=1
         )
         spread = dense(_spread(field, places, whole), 1)[..., 0]
-        return np.stack([(1 - share) * spread, share * spread])
+        return np.stack([share.get(view, 0.0) * spread for view in (0, 1)])
 
     dottest(forward, adjoint, (2, *whole), window, seed=seed)
+
+
+@law(25)
+@given(st.integers(0, 10**6), st.floats(0.0, 3.0))
+def test_fields_whose_rows_meet_different_sections_are_spread_section_by_section(seed, size):
+    """Each section's part of a field goes where a field of that section alone goes."""
+    rng, window, whole = np.random.default_rng(seed), (9, 7), (14, 12)
+    places = np.stack(np.indices(window) + 2.0, axis=-1) + size * rng.normal(size=(*window, 2))
+    field = Sensitivities(
+        values=rng.normal(size=(*window, 4)).astype(np.float32), first=rng.integers(0, 4, window[0]), motions=2
+    )
+    spread = _spread(field, places, whole)
+    assert (spread.first >= 0).all()
+    parts = dense(field, 10)
+    for k in range(10):
+        one = replace(field, values=parts[..., k : k + 1].astype(np.float32), first=0 * field.first, motions=1)
+        expected = dense(_spread(one, places, whole), 1)[..., 0]
+        np.testing.assert_allclose(dense(spread, 10)[..., k], expected, atol=1e-5)
 
 
 # Filters

@@ -136,3 +136,12 @@ def test_the_paper_s_options_are_the_paper_s():
     assert options.deformation == (StageOptions(scale=1, solver=Pgd(most_modes=4, passes_per_mode=1)),)
     assert options.weighting == "uniform"
     assert options.subtract_systematic
+    assert options.smooth_px == 0
+    assert not options.sharpen
+
+
+def test_by_default_the_last_stage_smooths_and_the_views_are_sharpened():
+    options = MeasureOptions()
+    assert [stage.solver.kind for stage in options.deformation] == ["pgd", "smoother"]
+    assert options.deformation[-1].scale == 1
+    assert options.sharpen

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pdvc.preparation import prepare
-from pdvc.radiographs import calibrate
+from pdvc.preparation import prepare, snr_reprojection, volume_choices
+from pdvc.projection import project_at_rest
+from pdvc.radiographs import calibrate, snr_db
+from pdvc.rays import ray_vectors
 from pdvc.setup import set_up
 from validation.scoring.bound import noise_free
 from validation.testing.small_cases import SmallExperiment, small_scenario
@@ -70,3 +72,57 @@ def test_the_noise_told_of_the_radiographs_is_what_they_differ_by_from_those_wit
     signal = told.images.grey.std(axis=(1, 2), dtype=float)
     expected = 20 * np.log10(signal / np.sqrt((apart**2).mean(axis=(1, 2))))
     assert told.snr_noise_db.mean() == pytest.approx(expected.mean(), abs=0.5)
+
+
+def test_views_are_sharpened_for_the_volume_alone():
+    """What is left of a view, and steps are compared with, is the view as it was."""
+    plain, sharp = (
+        prepare(set_up(SMALL.experiment, SMALL.options.model_copy(update={"sharpen": sharpen})), 1)
+        for sharpen in (False, True)
+    )
+    np.testing.assert_array_equal(sharp.view(7), plain.view(7))
+    np.testing.assert_array_equal(sharp.images.grey, plain.images.grey)
+    # rougher from voxel to voxel
+    rough = [np.diff(each.images.volume.values, axis=2).std() for each in (plain, sharp)]
+    assert rough[1] > 1.1 * rough[0]
+    for each in (plain, sharp):
+        rays = ray_vectors(SMALL.experiment.geometry, SMALL.experiment.reference.angle_rad[7]).stacked()
+        model = project_at_rest(each.images.volume, rays, each.systematic.detector)[0]
+        left = each.systematic.left(7)
+        reached = left.any(axis=1)
+        np.testing.assert_allclose(left[reached], (model - each.view(7))[reached], atol=1e-5)
+        first, rows = each.systematic.corner[0], each.systematic.shape[0]
+        assert reached[first : first + rows].all()
+
+
+def test_volumes_that_are_sharpened_and_others_are_not_taken_for_each_other():
+    one, other = (
+        volume_choices(SMALL.options.model_copy(update={"sharpen": sharpen}), SMALL.experiment.geometry)
+        for sharpen in (False, True)
+    )
+    assert one != other
+
+
+def test_the_mean_over_views_is_as_wide_as_half_a_pixel_at_the_section_s_edge():
+    setup = set_up(SMALL.experiment, SMALL.options)
+    for scale in (1, 2):
+        width = prepare(setup, scale).systematic.width_rad
+        assert width * setup.sections.radius_mm == pytest.approx(0.5 * scale * setup.geometry.voxel_mm)
+
+
+def test_the_snr_of_re_projection_is_that_of_the_views_that_steps_look_along():
+    """At rest those on both sides of each step's angle; of a sample that turned by a right angle, others."""
+    setup = set_up(SMALL.experiment, SMALL.options)
+    prepared, basis = prepare(setup, 1), setup.sections
+    still = np.zeros((len(SMALL.experiment.test), *basis.shape))
+    found = snr_reprojection(prepared, basis, still)
+    view, step = SMALL.experiment.reference.angle_rad, SMALL.experiment.test.angle_rad
+    away = np.abs(np.angle(np.exp(1j * np.subtract.outer(view, step))))
+    # views are nine degrees apart: three deviations of half of that
+    near = np.flatnonzero((away < 1.5 * 2 * np.pi / len(view)).any(axis=1))
+    row, column = prepared.systematic.corner
+    window = np.s_[row : row + prepared.systematic.shape[0], column : column + prepared.systematic.shape[1]]
+    used = np.ones(prepared.systematic.shape, dtype=bool)
+    expected = [snr_db(prepared.view(i)[window], prepared.systematic.left(i)[window], used) for i in near.tolist()]
+    np.testing.assert_allclose(found, expected)
+    assert (found > 10).all()

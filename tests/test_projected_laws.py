@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc import gauss_newton, pgd
-from pdvc.equations import Equations, linearise
+from pdvc.equations import Equations, joined, linearise
 from pdvc.prior import Prior
 from pdvc.uncertainty import posterior
 from tests.laws import law
@@ -73,7 +73,7 @@ def visible(case, difference):
     Along the beam rounding in single precision makes differences some R / r = 400 times as large, which no radiograph
     shows.
     """
-    matrix = gauss_newton.hessian(case.equations(case.amplitude).matrix, case.time_functions)
+    matrix = joined(case.equations(case.amplitude).matrix, case.time_functions)
     change = difference.ravel()
     return np.sqrt(change @ matrix @ change * len(change) / np.trace(matrix))
 
@@ -176,7 +176,7 @@ def test_more_steps_never_lower_the_information(case, believed, noise, data):
     few = sorted(data.draw(st.sets(st.sampled_from(steps), min_size=1, max_size=len(steps) - 1)))
     whole, functions = case.equations(0 * case.amplitude), case.time_functions
     part = part_of(whole, few)
-    more, less = gauss_newton.hessian(whole.matrix, functions), gauss_newton.hessian(part.matrix, functions[:, few])
+    more, less = joined(whole.matrix, functions), joined(part.matrix, functions[:, few])
     eigenvalues = np.linalg.eigvalsh(more - less)
     assert eigenvalues.min() > -1e-9 * eigenvalues.max()
     assert eigenvalues.max() > 0

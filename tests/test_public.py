@@ -25,7 +25,7 @@ from pdvc.solution import Problem
 from simulator.scanner import simulate
 from tests import synthetic_records as records
 from tests.command_line import install, pdvc_bench
-from tests.small_case import SECTIONS, STEPS, lineariser, radiographs
+from tests.small_case import SECTIONS, STEPS, lineariser, radiographs, series
 from tests.tiny_scenarios import TINY
 from validation.plan.designs import design_of_experiment, planned_like
 from validation.testing.small_cases import SmallExperiment, small_scenario
@@ -139,6 +139,8 @@ def test_a_section_motion_is_added_by_the_page_alone(added, tmp_path):
     found = GaussNewton(most_passes=8, least_change_voxel=1e-5).solve(
         Problem(
             linearise=lineariser(radiographs(sheared, amplitude), sheared),
+            basis=sheared,
+            series=series(),
             time_functions=np.ones((1, STEPS)),
             start=np.zeros((1, *sheared.shape)),
             prior=Prior(deviation_voxel=np.full(sheared.shape, 30.0)),

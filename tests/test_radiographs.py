@@ -20,6 +20,7 @@ from pdvc.radiographs import (
     grey_levels,
     grey_noise,
     noise_overlap,
+    sharpened,
     smoothed,
     snr_db,
 )
@@ -233,6 +234,43 @@ def test_filtered_noise_overlaps_with_its_neighbours_as_told(smooth_px):
     seen = [(noise * noise).mean(), (noise[:, 1:] * noise[:, :-1]).mean(), (noise[2:] * noise[:-2]).mean()]
     # 200 000 pixels, of which some ten are alike: known to half a per cent
     np.testing.assert_allclose(seen, [c0 * c0, c0 * c1, c0 * c2], atol=0.02 * c0 * c0)
+
+
+@law(40)
+@given(st.floats(0.0, 0.5), st.floats(0.0, 0.5), st.floats(0.0, 6.0))
+def test_sharpening_multiplies_a_wave_by_what_two_interpolations_take_from_it(down, across, phase):
+    """By 6 / (4 + 2 cos(2 pi k)) along each axis, k in cycles per pixel: 1.5 for k = 1/4, three at most."""
+    row, column = np.indices((50, 60))
+    wave = np.cos(2 * np.pi * down * row + phase) * np.cos(2 * np.pi * across * column)
+    gain = [6 / (4 + 2 * np.cos(2 * np.pi * k)) for k in (down, across)]
+    inner = (slice(15, -15), slice(15, -15))
+    found = sharpened(wave.astype(np.float32))
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found[inner], (gain[0] * gain[1] * wave)[inner], atol=2e-5)
+
+
+@pytest.mark.parametrize("k", [0.05, 0.15, 0.25])
+def test_sharpening_gives_back_what_interpolating_twice_takes(k):
+    """Linear interpolation at random places, twice, leaves sinc(k)^4 of a wave on average; sharpened, nearly all."""
+    rng, x = np.random.default_rng(1), np.arange(400.0)
+    wave = np.exp(2j * np.pi * k * x)
+    images = np.stack([wave.real, wave.imag]).astype(np.float32)
+    for image, whole in ((images, False), (np.stack([sharpened(np.tile(i, (9, 1)))[4] for i in images]), True)):
+        left = []
+        for _ in range(400):
+            first, second = rng.uniform(size=2)
+            # two grids at any places against the pixels, one after the other
+            once = [np.interp(x + first, x, part) for part in image]
+            twice = np.interp(x + second, x, once[0]) + 1j * np.interp(x + second, x, once[1])
+            left.append((twice * np.exp(-2j * np.pi * k * (x + first + second)))[50:-50].mean().real)
+        assert np.mean(left) == pytest.approx(1 if whole else np.sinc(k) ** 4, abs=0.02)
+
+
+@law(20)
+@given(st.floats(-9.0, 9.0), st.integers(6, 40), st.integers(6, 40))
+def test_sharpening_leaves_an_even_image_even_to_its_edges(level, rows, columns):
+    image = np.full((rows, columns), level, dtype=np.float32)
+    np.testing.assert_allclose(sharpened(image), image, atol=1e-4 * (1 + abs(level)))
 
 
 def test_images_without_contrast_have_an_snr_too():

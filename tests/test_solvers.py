@@ -13,13 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pdvc import gauss_newton, pgd
-from pdvc.equations import linearise, residuals
+from pdvc.equations import joined, linearise, residuals
 from pdvc.prior import Prior
 from pdvc.systematic import Systematic
 from pdvc.verdict import Stop
 from tests.laws import law
 from tests.linear_problems import chi2_of, linear_model, random_equations, random_functions
 from tests.small_case import (
+    ANGLES,
     SECTIONS,
     SHAPE,
     STEPS,
@@ -50,7 +51,16 @@ def test_the_hessian_is_the_sum_of_kronecker_products(seed):
     expected = sum(
         np.kron(np.outer(functions[:, t], functions[:, t]), equations.matrix[t]) for t in range(functions.shape[1])
     )
-    np.testing.assert_allclose(gauss_newton.hessian(equations.matrix, functions), expected, rtol=1e-10, atol=1e-8)
+    np.testing.assert_allclose(joined(equations.matrix, functions), expected, rtol=1e-10, atol=1e-8)
+
+
+@given(st.integers(0, 10**6), st.integers(1, 5))
+@law(20)
+def test_blocks_that_join_pairs_of_steps_have_the_functions_of_both(seed, pairs):
+    rng = np.random.default_rng(seed)
+    blocks, one, other = rng.normal(size=(pairs, 4, 4)), rng.normal(size=(3, pairs)), rng.normal(size=(3, pairs))
+    expected = sum(np.kron(np.outer(one[:, n], other[:, n]), blocks[n]) for n in range(pairs))
+    np.testing.assert_allclose(joined(blocks, one, other), expected, atol=1e-10)
 
 
 @given(st.integers(0, 10**6), st.floats(0.05, 10.0))
@@ -291,9 +301,16 @@ def test_the_equations_at_the_truth_ask_for_nothing():
 def test_the_systematic_residual_is_taken_off_the_radiographs():
     """A constant left by the re-projection, found in all views, changes the residual by just that."""
     images = images_of("full")
-    left = np.full((1, SHAPE[0] + 8, SHAPE[1] + 8), 0.25, dtype=np.float32)
-    one = np.zeros(STEPS, dtype=np.int64)
-    systematic = Systematic(fields=left, first=one, second=one, share=np.zeros(STEPS), corner=(4, 4), shape=SHAPE)
+    detector = (SHAPE[0] + 8, SHAPE[1] + 8)
+    systematic = Systematic(
+        left=lambda view: np.full(detector, 0.25, dtype=np.float32),
+        view_rad=np.linspace(0, 2 * np.pi, 9, endpoint=False),
+        step_rad=ANGLES,
+        corner=(4, 4),
+        shape=SHAPE,
+        detector=detector,
+        width_rad=0.1,
+    )
     rested = np.zeros((STEPS, *SECTIONS.shape))
     plain = residuals(images, SECTIONS, rested)
     corrected = residuals(replace(images, systematic=systematic), SECTIONS, rested)
