@@ -83,7 +83,9 @@ def known_from_residual(rms: float, window: tuple[int, int], detector: tuple[int
     filter leaves what `noise_overlap` tells.
     """
     between = np.linspace(0, 1, 101)
-    left = float(np.mean(np.sum(np.square(taps(between, np.zeros(101, dtype=np.int64))), axis=0))) ** 2 * 2 / 3
+    left = float(np.mean(np.sum(np.square(taps(between, np.zeros(101, dtype=np.int64))), axis=0))) ** 2 / np.sqrt(
+        np.pi
+    )
     variance = rms**2 / noise_overlap(smooth_px)[0] ** 2 / (1 + left)
 
     def uniform(shape: tuple[int, ...]) -> ImageNoise:

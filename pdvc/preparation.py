@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -139,7 +139,7 @@ class Care:
     smooth_px: float = 0.0
     """Filter of the radiographs, px."""
     sharpen: bool = False
-    """Whether radiographs are sharpened by what interpolation blurs."""
+    """Whether radiographs are sharpened by what interpolation blurs, and the phase of what it shifts is corrected."""
 
 
 def scan_volume(
@@ -164,7 +164,26 @@ def scan_volume(
         return {"F": fdk(seen, geometry, series.angle_rad, grid, hull, progress=progress, task=task)}
 
     values = keep(reconstructed)["F"]
-    return Volume(values=values, grid=grid, hull=hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm))
+    reached = hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm)
+    phase = phase_correction(values) if care.sharpen else 0.0
+    return Volume(values=values, grid=grid, hull=reached, phase=phase)
+
+
+def phase_correction(values: NDArray[np.float32]) -> float:
+    """Return k^2 / 6 of the volume's texture along z, by its slopes: k^2 = sum (second differences)^2 / sum (first)^2.
+
+    At most that of a wave of six voxels: what is finer is noise.
+    """
+    first, second = (
+        sum(float(np.square(layer, dtype=float).sum()) for layer in _differences(values, n)) for n in (1, 2)
+    )
+    return min(second / max(first, 1e-300), 1.0) / 6
+
+
+def _differences(values: NDArray[np.float32], order: int) -> Iterator[NDArray[np.float32]]:
+    """Yield the differences of a volume's layers, or the differences of these."""
+    for k in range(len(values) - order):
+        yield np.diff(values[k : k + order + 1], order, axis=0)
 
 
 def _systematic(

@@ -14,9 +14,9 @@ l_j. States bend at random from step to step: with gaps g of time between steps,
     q_j^2 = q^2 (l_j / l_0)^r        of mode j of a motion, with roughness r
 
 A slip, or the onset of loading, is a w far larger than others. s(t) is therefore drawn, too, so that w has Student's
-distribution, once for the six rigid motions and once for all others; an event is found where the data show one. First
-and last step alone keep the state from anywhere, N(0, e^2 (l_j / l_0)^r): time has no direction. With no gaps at all
-the model is a(t) of each step by itself.
+distribution, by itself for each of the six rigid motions and once for all modes; an event is found where the data
+show one. First and last step alone keep the state from anywhere, N(0, e^2 (l_j / l_0)^r): time has no direction. With
+bends as large as one likes the model is a(t) of each step by itself.
 
 Where sections contract as much as they are stretched, the contraction is a part of the state's axial motion,
 
@@ -68,9 +68,9 @@ scatters by 0.14. What the model of the image misses, an edge along the beam, co
 than the misfit of all tells."""
 ASIDE = 10.0
 """Times by which the noise of such a radiograph is then taken larger."""
-LEAST_VARIANCE = 1e-13
+LEAST_VARIANCE = 1e-12
 """voxel^2, of any bend and any end: less would be lost in rounding, and moves nothing in a thousand steps."""
-_RANGE = np.log([1e-6, 10.0]), np.log([1e-4, 30.0]), np.array([0.2, 3.0])
+_RANGE = np.log([1e-5, 10.0]), np.log([1e-4, 30.0]), np.array([0.2, 3.0])
 """Limits of log q, log e, and r."""
 
 
@@ -100,7 +100,7 @@ class Deviations:
     roughness: Floats
     """r (section motion,)."""
     rigid_scale: Floats
-    """s of the rigid motions (step - 2,)."""
+    """s of each rigid motion (step - 2, rigid motion)."""
     own_scale: Floats
     """s of all others (step - 2,)."""
     misfit: Floats
@@ -165,7 +165,7 @@ class StateSpace:
             bend_voxel=np.full(self.rigid + motions, TYPICAL_VOXEL),
             end_voxel=np.full(motions, 1.0),
             roughness=np.ones(motions),
-            rigid_scale=np.ones(max(steps - 2, 0)),
+            rigid_scale=np.ones((max(steps - 2, 0), self.rigid)),
             own_scale=np.ones(max(steps - 2, 0)),
             misfit=np.ones(steps),
         )
@@ -185,7 +185,8 @@ class StateSpace:
     def bend_variance(self, deviations: Deviations) -> Floats:
         """Return the prior variance of w (step - 2, state), voxel^2."""
         own = deviations.bend_voxel[self.group] ** 2 * self.relative(deviations)
-        scale = np.where(self.group < self.rigid, deviations.rigid_scale[:, None], deviations.own_scale[:, None])
+        of_modes = np.repeat(deviations.own_scale[:, None], len(own) - self.rigid, axis=1)
+        scale = np.concatenate([deviations.rigid_scale, of_modes], axis=1)
         return np.asarray(own * scale * self._gap[:, None] + LEAST_VARIANCE)
 
     def end_variance(self, deviations: Deviations) -> Floats:
@@ -368,7 +369,7 @@ class Process:
         """Return deviations with scales as expected under Student's distribution."""
         space = self.space
         bends, _ = self._squares(smoothed, inverse)
-        flat = replace(deviations, rigid_scale=np.ones(len(bends)), own_scale=np.ones(len(bends)))
+        flat = replace(deviations, rigid_scale=np.ones((len(bends), space.rigid)), own_scale=np.ones(len(bends)))
         share = bends / space.bend_variance(flat)
         rigid = space.group < space.rigid
         covariance = self.covariance(smoothed, inverse)
@@ -376,7 +377,7 @@ class Process:
         spread = np.einsum("tnm,tmk,tnk->t", self.seen.design, covariance, self.seen.design, optimize=True)
         return replace(
             deviations,
-            rigid_scale=_expected(share[:, rigid]),
+            rigid_scale=_expected(share[:, rigid, None]),
             own_scale=_expected(share[:, ~rigid]),
             misfit=set_aside((FREEDOM + (left**2).sum(axis=1) + spread) / (FREEDOM + self.seen.unknowns)),
         )
@@ -393,8 +394,8 @@ def set_aside(misfit: Floats) -> Floats:
 
 
 def _expected(share: Floats) -> Floats:
-    """Return the scale of each step, from E[w^2] over its variance at scale one (step, state)."""
-    return np.asarray((FREEDOM + share.sum(axis=1)) / (FREEDOM + share.shape[1]))
+    """Return scales (step, ...), from E[w^2] over its variance at scale one (step, ..., state)."""
+    return np.asarray((FREEDOM + share.sum(axis=-1)) / (FREEDOM + share.shape[-1]))
 
 
 def _modes(height_mm: Floats, most: int) -> tuple[Floats, Floats]:

@@ -188,6 +188,7 @@ def _scene(volume: Volume, basis: SectionBasis, voxel_mm: float) -> Scene:
         heights=(basis.height_mm - origin[2]) / grid.voxel_mm,
         patterns=np.ascontiguousarray(patterns.reshape(*basis.shape, 12)),
         voxel_mm=grid.voxel_mm,
+        phase=volume.phase,
     )
 
 

@@ -50,8 +50,8 @@ RANK = 300
 """Directions of noise common to steps that are followed, the largest."""
 WEAK = 1e-6
 """Ridge of the metric, over its diagonal."""
-EVENT = 25.0
-"""Scale of bends from which on a step is told as an event: five times the typical bend."""
+EVENT = 100.0
+"""Scale of bends from which on a step is told as an event: ten times the typical bend."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class Smoother(Solver):
     """converged: the displacement changes by less than this, voxel rms"""
     trend: tuple[TimeFunction, ...] = (Angle(),)
     """time functions of the rigid motion of the whole sample, beside the process"""
-    bend_voxel: Annotated[float, Field(gt=0)] | Literal["fit"] = "fit"
+    bend_voxel: Annotated[float, Field(ge=1e-5)] | Literal["fit"] = "fit"
     """deviation of all bends from step to step, voxels; fit: found in the data, for each motion"""
     contraction_of_strain: Annotated[float, Field(ge=-0.5, le=0.5)] | Literal["none"] = 0.5
     """contraction expected for an axial strain, the rest of it found: 0.5 keeps the volume; none: not tied"""
@@ -272,7 +272,7 @@ def _in_words(deviations: Deviations) -> str:
     """Say what the process is like."""
     bends = deviations.bend_voxel
     said = f"bends from step to step of {bends.min():.1g} to {bends.max():.1g} voxel"
-    events = np.flatnonzero(np.maximum(deviations.rigid_scale, deviations.own_scale) > EVENT) + 1
+    events = np.flatnonzero(np.maximum(deviations.rigid_scale.max(axis=1), deviations.own_scale) > EVENT) + 1
     if len(events):
         said += f", far larger at step {listed(events.tolist())}"
     misfits = np.flatnonzero(deviations.misfit > ASIDE)

@@ -61,6 +61,8 @@ class Scene(NamedTuple):
     """What each motion does at unit amplitude, an affine map of the place (section, motion, 12)."""
     voxel_mm: float
     """Voxel of the volume, mm: F is given per mm."""
+    phase: float
+    """`pdvc.volume.Volume.phase`."""
 
 
 class Steps(NamedTuple):
@@ -108,7 +110,8 @@ def walk_bands(scene, steps, sums, with_sensitivities):  # type: ignore[no-untyp
 @njit(nogil=True, cache=True, error_model="numpy")
 def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore[no-untyped-def]
     """Walk the rays of one band of rows of step t."""
-    volume, shape, place, support, heights, patterns, voxel_mm = scene
+    volume, shape, place, support, heights, patterns, voxel_mm, phase64 = scene
+    phase = _f(phase64)
     box, rays, maps, target = steps.box[t], steps.rays[t], steps.maps[t], steps.target[t]
     weight, low = steps.weight[t % len(steps.weight)], steps.low[t, band]
     matrix, vector, chi2 = sums.matrices[t, band], sums.vectors[t, band], sums.chi2[t]
@@ -174,7 +177,7 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
                         # length of the ray from plane to plane, mm: F is per mm
                         scale = voxel_mm / abs(bm)
                         if with_sensitivities:
-                            sums8 = _sum_all(volume, strides, limit, first, last, path32)
+                            sums8 = _sum_all(volume, strides, limit, first, last, path32, phase)
                             value += sums8[0] * scale
                             nine = _nine_sums(sums8, turned, along_x)
                             if k_last < 0:
@@ -191,7 +194,7 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
                                 out = s[at : at + motions]
                                 _add_section(patterns[j1], s0, s1, base, along, nine, scale, k12, out)
                         else:
-                            value += scale * _sum_values(volume, strides, limit, first, last, path32)
+                            value += scale * _sum_values(volume, strides, limit, first, last, path32, phase)
                 a = b
             rho = value - target[row, column]
             residual[row, column] = rho
@@ -227,8 +230,15 @@ def _aim(rays, middle, row, column, base, along):  # type: ignore[no-untyped-def
     return reach
 
 
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, inline="always")
+def _in_phase(f, phase):  # type: ignore[no-untyped-def]
+    """Return the share of the next voxel at a place f in [0, 1] after one, and its derivative: `Volume.phase`."""
+    away = f * (_f(1) - f)
+    return f + phase * away * (_f(1) - _f(2) * f), _f(1) + phase * (_f(1) - _f(6) * away)
+
+
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _sum_all(volume, strides, limit, first, last, path):  # type: ignore[no-untyped-def]
+def _sum_all(volume, strides, limit, first, last, path, phase):  # type: ignore[no-untyped-def]
     """Sum F times 1, l, and d_o F times 1, l, l^2, over the planes first <= k < last that the ray crosses.
 
     `path` holds the coefficients of x'(l) for the axes m, o, z, and `strides` and `limit` theirs. This loop is where
@@ -251,7 +261,8 @@ def _sum_all(volume, strides, limit, first, last, path):  # type: ignore[no-unty
         o = min(max(ao + t * (bo + t * co), _f(0)), most_o)
         z = min(max(az + t * (bz + t * cz), _f(0)), most_z)
         io, iz = np.int32(o), np.int32(z)
-        fo, fz = o - _f(io), z - _f(iz)
+        fo, slope_o = _in_phase(o - _f(io), phase)
+        fz, slope_z = _in_phase(z - _f(iz), phase)
         # unsigned indices: signed ones of 32 bits were slower, and these reach twice as far
         p = np.uint32(iz * stride_z + io * stride_o + np.uint32(k) * stride_m)
         q = p + stride_z
@@ -261,8 +272,8 @@ def _sum_all(volume, strides, limit, first, last, path):  # type: ignore[no-unty
         low = a00 + fo * d0
         dz = a10 + fo * d1 - low
         value = share * (low + fz * dz)
-        do = share * (d0 + fz * (d1 - d0))
-        dz *= share
+        do = share * slope_o * (d0 + fz * (d1 - d0))
+        dz *= share * slope_z
         v0 += value
         v1 += t * value
         g0 += do
@@ -277,7 +288,7 @@ def _sum_all(volume, strides, limit, first, last, path):  # type: ignore[no-unty
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _sum_values(volume, strides, limit, first, last, path):  # type: ignore[no-untyped-def]
+def _sum_values(volume, strides, limit, first, last, path, phase):  # type: ignore[no-untyped-def]
     """Sum F over the planes first <= k < last that the ray crosses; arguments as of _sum_all."""
     am, bm, cm, ao, bo, co, az, bz, cz = path
     stride_m, stride_o, stride_z = strides
@@ -291,7 +302,7 @@ def _sum_values(volume, strides, limit, first, last, path):  # type: ignore[no-u
         o = min(max(ao + t * (bo + t * co), _f(0)), most_o)
         z = min(max(az + t * (bz + t * cz), _f(0)), most_z)
         io, iz = np.int32(o), np.int32(z)
-        fo, fz = o - _f(io), z - _f(iz)
+        fo, fz = _in_phase(o - _f(io), phase)[0], _in_phase(z - _f(iz), phase)[0]
         p = np.uint32(iz * stride_z + io * stride_o + np.uint32(k) * stride_m)
         q = p + stride_z
         a00, a01, a10, a11 = volume[p], volume[p + stride_o], volume[q], volume[q + stride_o]

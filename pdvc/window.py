@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,14 +53,21 @@ def height_mm(geometry: ConeBeam, row: float) -> float:
 
 
 def scan_grid(geometry: ConeBeam, hull: Hull) -> Grid:
-    """Return the voxels that a scan is reconstructed on: around the hull, as high as every view sees."""
+    """Return the voxels that a scan is reconstructed on: around the hull, as high as every view sees.
+
+    Layers lie halfway between the heights at which rows look through the axis. Where the beam is level they would else
+    lie on them, or anywhere: interpolation along z would blur nothing there, and much elsewhere.
+    """
     low, high = hull.box_mm()
     reach = seen_half_height_mm(geometry, hull.radius_mm())
     # two voxels of air around the hull keep interpolation, and its gradient, inside the grid
     margin = np.full(3, 2 * geometry.voxel_mm)
     low, high = low - margin, high + margin
     low[2], high[2] = max(low[2], -reach), min(high[2], reach)
-    return Grid.around(low, high, geometry.voxel_mm)
+    grid = Grid.around(low, high, geometry.voxel_mm)
+    x, y, z = grid.origin_mm
+    half = height_mm(geometry, 0) + geometry.voxel_mm / 2
+    return replace(grid, origin_mm=(x, y, z + (half - z) % geometry.voxel_mm))
 
 
 def kept_heights_mm(grid: Grid) -> Floats:
