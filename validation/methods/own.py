@@ -29,6 +29,11 @@ def pgd(experiment: Experiment) -> Measurement:
     return measure(experiment, paper_options())
 
 
+def smoother(experiment: Experiment) -> Measurement:
+    """Measure by the default protocol."""
+    return measure(experiment)
+
+
 def gauss_newton(experiment: Experiment) -> Measurement:
     """Measure by direct solves of all unknowns, from coarse to fine, with the default bases."""
     return measure(experiment, _DIRECT)
@@ -68,6 +73,13 @@ PGD = Method(
     assumes="Assume that few space-time modes hold the motion, of rigid sections and of the paper's seven time "
     "functions: eight of the sample as a whole, then four of its sections, each from one linearisation. All pixels "
     "count alike.",
+)
+SMOOTHER = Method(
+    name="smoother",
+    measure=smoother,
+    assumes="Assume sections that move rigidly or contract, and a motion of any history, smooth over the steps as far "
+    "as the radiographs say so but for events; contraction is expected to keep the volume, and found where it does "
+    "not.",
 )
 GAUSS_NEWTON = Method(
     name="gauss-newton",

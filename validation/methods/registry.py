@@ -17,7 +17,7 @@ from pdvc.measurement import Measurement
 
 GROUP = "pdvc_bench.methods"
 """The entry-point group in which methods are looked for."""
-OWN = ("pgd", "gauss-newton", "weighted", "each-step", "classical-dvc", "spam")
+OWN = ("pgd", "smoother", "gauss-newton", "weighted", "each-step", "classical-dvc", "spam")
 """Our own methods, in the order in which they are shown; others come after them."""
 
 EXTRA = ("spam",)
