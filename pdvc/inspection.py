@@ -81,7 +81,7 @@ def _cost(setup: Setup, outlining_s: float, progress: Progress) -> Forecast:
     # the outline took two coarse reconstructions of some 150 views; scale 1 has more of both
     rows = min(geometry.rows, 240)
     finer = (geometry.rows / rows) ** 3 * len(reference) / min(len(reference), 150)
-    time_functions = setup.time_functions()
+    time_functions = setup.options.deformation[-1].solver.functions(setup.time_functions())
     pixels = float(geometry.rows * geometry.columns)
     memory = 8 * voxels + 4 * pixels * len(reference) / 2 + 24 * steps * target.size
     memory += memory_bytes(time_functions, basis)

@@ -483,7 +483,7 @@ def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
                 if values[row, column, k] != 0:
                     empty = False
                     break
-            r, c = places[row, column]
+            r, c, longer = places[row, column]
             i, j = first_pixel(r, rows), first_pixel(c, columns)
             if empty or i < 0 or j < 0:
                 continue
@@ -493,7 +493,7 @@ def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
                 # where the sections of this row of the window begin in that row of the detector
                 start = offset[row, to_row]
                 for n in range(4):
-                    share = np.float32(down[m] * right[n])
+                    share = np.float32(longer * down[m] * right[n])
                     if share != 0:
                         to = out[to_row, min(max(j - 1 + n, 0), columns - 1)]
                         for k in range(values.shape[2]):

@@ -28,7 +28,7 @@ from pdvc.digest import digest
 from pdvc.equations import STEPS_AT_ONCE, Images, joined, linearise
 from pdvc.experiment import Experiment, Series
 from pdvc.history import time_basis
-from pdvc.noise import Pile, overlaid, product
+from pdvc.noise import BELIEF, Pile, adjoint, overlaid, product
 from pdvc.options import MeasureOptions
 from pdvc.preparation import prepare, stated_noise
 from pdvc.progress import Progress, silent
@@ -100,12 +100,19 @@ class Planner:
         noise = stated_noise(self._setup, prepared)
         self._noise = noise
         self._images = prepared.images
+        self._systematic = prepared.systematic
         self._corner = prepared.systematic.corner
         left = noise_overlap(noise.smooth_px)[0] ** 2
         self._variance = left * float(
             np.mean([noise.step(t).variance.mean() for t in range(len(self._reference_rad))])
         )
-        self._worked_out: dict[str, tuple[Floats, Floats, Floats]] = {}
+        self._worked_out: dict[str, tuple[Floats, Floats, Floats, Floats]] = {}
+
+    @property
+    def _window(self) -> tuple[slice, slice]:
+        """Return the used rows and columns of the detector."""
+        (row, column), (rows, columns) = self._corner, self._systematic.shape
+        return slice(row, row + rows), slice(column, column + columns)
 
     @property
     def heights_mm(self) -> tuple[float, float]:
@@ -128,8 +135,8 @@ class Planner:
         """Return how well the motion of a test would be known."""
         basis = self._setup.with_sections(self._setup.options.sections if test.sections is None else test.sections)
         functions = time_basis(tuple(part.stretched(test.share) for part in self._time), test.recorded())
-        matrix, noise, flats = self._sums(basis, functions, test)
-        noise = noise + flats / test.flats
+        matrix, noise, flats, believed = self._sums(basis, functions, test)
+        noise = (noise + flats / test.flats) / test.frames + believed
         # the solvers count residuals, which the prior's ridge follows
         gamma2 = self._variance / test.frames
         ridge = np.full(len(noise), gamma2 / self.prior_voxel**2)
@@ -138,17 +145,24 @@ class Planner:
             time_functions=functions,
             angle_rad=test.angle_rad,
             voxel_mm=self._setup.geometry.voxel_mm,
-            covariance=sandwich(matrix, noise / test.frames, ridge, gamma2),
+            covariance=sandwich(matrix, noise, ridge, gamma2),
         )
 
-    def _sums(self, basis: SectionBasis, functions: Floats, test: PlannedTest) -> tuple[Floats, Floats, Floats]:
-        """Return H, V of all images but the flats, and V of the flats, with the reference scan's frames and flats."""
+    def _sums(
+        self, basis: SectionBasis, functions: Floats, test: PlannedTest
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return H, and V of all images but the flats, of the flats, and of what re-projection leaves.
+
+        With the reference scan's frames and flats.
+        """
         key = digest(basis, functions, test.angle_rad, test.moved_mm)
         if key not in self._worked_out:
             self._worked_out[key] = self._worked(basis, functions, test)
         return self._worked_out[key]
 
-    def _worked(self, basis: SectionBasis, functions: Floats, test: PlannedTest) -> tuple[Floats, Floats, Floats]:
+    def _worked(
+        self, basis: SectionBasis, functions: Floats, test: PlannedTest
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         angle_rad = test.angle_rad
         # steps a turn apart see the same
         _, first, turn = np.unique(np.round(angle_rad % (2 * np.pi), 9), return_index=True, return_inverse=True)
@@ -159,20 +173,23 @@ class Planner:
         matrix = linearise(images, basis, still, progress=self._progress, task=task).matrix
         was = self._places(test)
         pile, noise = Pile(self._noise.flat.shape, functions, basis.shape[1]), np.empty_like(matrix)
+        believed = np.zeros(matrix.shape[:2])
         # all steps at one angle have the noise of its view in common, and so have angles with the same view
         shared = np.stack([functions[:, turn == k].sum(axis=1) for k in range(len(first))], axis=1)
         alike: dict[int, list[tuple[int, Sensitivities]]] = defaultdict(list)
-        left, between = Counter(views.tolist()), np.zeros((len(functions), matrix.shape[1]) * 2)
+        unseen, between = Counter(views.tolist()), np.zeros((len(functions), matrix.shape[1]) * 2)
         for k, field in enumerate(self._fields(images, basis)):
             view = int(views[k])
             step = self._noise.step(view)
+            left = self._systematic.left(view)[self._window]
+            believed[k] = BELIEF * adjoint(field, left, matrix.shape[1])
             noise[k] = product(field, field, step.variance, matrix.shape[1])
             for other, seen in alike[view]:
                 joint = product(field, seen, step.variance, matrix.shape[1])
                 both = np.einsum("f,nm,g->fngm", shared[:, k], joint, shared[:, other])
                 between += both + both.transpose(2, 3, 0, 1)
-            left[view] -= 1
-            if left[view]:
+            unseen[view] -= 1
+            if unseen[view]:
                 alike[view].append((k, field))
             else:
                 del alike[view]
@@ -181,7 +198,9 @@ class Planner:
                 pile.add(int(t), overlaid(moved, self._noise.flat.shape))
         of_steps, of_views = joined(noise[turn], functions), joined(noise, shared)
         covariance = of_steps + of_views + between.reshape(of_views.shape)
-        return joined(matrix[turn], functions), covariance, pile.covariance(self._noise.flat, matrix.shape[1])
+        flats = pile.covariance(self._noise.flat, matrix.shape[1])
+        common = (functions @ believed[turn]).ravel()
+        return joined(matrix[turn], functions), covariance, flats, np.outer(common, common)
 
     def _nearest(self, angle_rad: Floats) -> NDArray[np.intp]:
         """Return the reference views nearest to angles."""

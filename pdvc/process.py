@@ -51,21 +51,22 @@ Indices = NDArray[np.intp]
 FITTED_MODES = 12
 """Modes along z of each motion, at most, when deviations are found: how they fall off tells of all others."""
 FREEDOM = 4.0
-"""Degrees of freedom of Student's distribution of bends, and of the radiographs' misfit."""
+"""Degrees of freedom of Student's distribution of the bends of all modes together, and of the radiographs' misfit."""
+RIGID_FREEDOM = 1.0
+"""The same of the bends of one rigid motion, which may slip by many times what it usually does: Cauchy's."""
 LONGEST_GAP = 4.0
 """Gap between steps, in median gaps, beyond which the sample is held rather than moved."""
-ROUNDS = 3
+ROUNDS = 4
 """Times that deviations and scales are found in turn."""
-EVALUATIONS = 10
+EVALUATIONS = 8
 """Of the marginal likelihood in each round."""
 TYPICAL_VOXEL = 0.01
 """Median of the broad prior of deviations q, voxels."""
 SPREAD = 2.5
 """Standard deviation of the broad priors' logarithms."""
-FAR = 1.4
-"""Misfit, over that of most steps, from which on a radiograph counts as not understood: with a hundred unknowns it
-scatters by 0.14. What the model of the image misses, an edge along the beam, concerns few motions, and those far more
-than the misfit of all tells."""
+FAR = 3.5
+"""Standard deviations beyond most steps' misfit from which on a radiograph counts as not understood. What the model of
+the image misses, an edge along the beam, concerns few motions, and those far more than the misfit of all tells."""
 ASIDE = 10.0
 """Times by which the noise of such a radiograph is then taken larger."""
 LEAST_VARIANCE = 1e-12
@@ -315,10 +316,13 @@ class Process:
 
     def fitted(self, deviations: Deviations, rounds: int = ROUNDS) -> Deviations:
         """Return deviations of the largest marginal likelihood: q, e and r, and the scales, in turn."""
-        for _ in range(rounds):
+        for left in reversed(range(rounds)):
             deviations = self._likeliest(deviations)
             smoothed = self.smoothed(deviations)
             deviations = self._rescaled(deviations, smoothed, smoothed.factor.inverted())
+            # only once events have been found: until then they look like radiographs that do not fit
+            if left == 0:
+                deviations = replace(deviations, misfit=set_aside(deviations.misfit, self.seen.unknowns))
         return deviations
 
     def _squares(self, smoothed: Smoothed, inverse: Blocks) -> tuple[Floats, Floats]:
@@ -377,9 +381,9 @@ class Process:
         spread = np.einsum("tnm,tmk,tnk->t", self.seen.design, covariance, self.seen.design, optimize=True)
         return replace(
             deviations,
-            rigid_scale=_expected(share[:, rigid, None]),
-            own_scale=_expected(share[:, ~rigid]),
-            misfit=set_aside((FREEDOM + (left**2).sum(axis=1) + spread) / (FREEDOM + self.seen.unknowns)),
+            rigid_scale=_expected(share[:, rigid, None], RIGID_FREEDOM),
+            own_scale=_expected(share[:, ~rigid], FREEDOM),
+            misfit=(FREEDOM + (left**2).sum(axis=1) + spread) / (FREEDOM + self.seen.unknowns),
         )
 
 
@@ -388,14 +392,15 @@ def _slope(squares: Floats, variance: Floats) -> Floats:
     return np.asarray((squares / variance - 1) * (1 - LEAST_VARIANCE / variance))
 
 
-def set_aside(misfit: Floats) -> Floats:
-    """Return misfits (step,), those far beyond the others made `ASIDE` times as large."""
-    return np.asarray(np.where(misfit > FAR * np.median(misfit), ASIDE * misfit, misfit))
+def set_aside(misfit: Floats, count: int) -> Floats:
+    """Return misfits (step,), each of a `count` of data, those far beyond the others made `ASIDE` times as large."""
+    limit = (1 + FAR * np.sqrt(2 / count)) * np.median(misfit)
+    return np.asarray(np.where(misfit > limit, ASIDE * misfit, misfit))
 
 
-def _expected(share: Floats) -> Floats:
+def _expected(share: Floats, freedom: float) -> Floats:
     """Return scales (step, ...), from E[w^2] over its variance at scale one (step, ..., state)."""
-    return np.asarray((FREEDOM + share.sum(axis=-1)) / (FREEDOM + share.shape[-1]))
+    return np.asarray((freedom + share.sum(axis=-1)) / (freedom + share.shape[-1]))
 
 
 def _modes(height_mm: Floats, most: int) -> tuple[Floats, Floats]:

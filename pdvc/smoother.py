@@ -50,8 +50,8 @@ RANK = 300
 """Directions of noise common to steps that are followed, the largest."""
 WEAK = 1e-6
 """Ridge of the metric, over its diagonal."""
-EVENT = 100.0
-"""Scale of bends from which on a step is told as an event: ten times the typical bend."""
+EVENT = 25.0
+"""Scale of bends from which on a step is told as an event: five times the typical bend."""
 
 
 @dataclass(frozen=True, kw_only=True)

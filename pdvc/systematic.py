@@ -13,7 +13,7 @@ sample and subtracted from the residual (section 4.1). Two things move:
   as the section is turned by half a pixel. It is a mean over the views around theta + delta that is not wider
   (`views_around`), which leaves the less of the views' noise the closer they are;
 - the place. A pixel's e is taken where the point of its ray that is nearest to the axis was before it moved,
-  projected at that angle.
+  projected at that angle. It grows as the path through the material there does.
 
 e has edges of a pixel or two, ten times above its noise, so that it is interpolated by Keys' cubic convolution on
 4 x 4 pixels (R. G. Keys, IEEE Trans. ASSP 29 (1981) 1153-1160).
@@ -157,11 +157,13 @@ class Systematic:
         return result
 
     def places(self, step: int, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Floats:
-        """Return where e is taken for each pixel of one step: (row, column, 2), row and column on the detector.
+        """Return where e is taken for each pixel of one step, row and column on the detector, and a factor.
+
+        Together (row, column, 3); the factor is how many times as long the path through the material is as before.
 
         `rays` (4, 3) of the window, mm; `amplitude` (section, motion) in voxels of `voxel_mm`.
         """
-        result = np.empty((*self.shape, 2))
+        result = np.empty((*self.shape, 3))
         _find_places(
             rays,
             float(turned_rad(rays[None], basis, amplitude[None], voxel_mm)[0]),
@@ -238,20 +240,16 @@ def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _stretch(m, x, y, z):  # type: ignore[no-untyped-def]
-    """Return by how much an affine map stretches along a unit vector."""
-    return (
-        x * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z)
-        + y * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z)
-        + z * (m[2, 0] * x + m[2, 1] * y + m[2, 2] * z)
-    )
+def _turned(m, i, x, y, z):  # type: ignore[no-untyped-def]
+    """Return component i of a vector under the linear part of an affine map."""
+    return m[i, 0] * x + m[i, 1] * y + m[i, 2] * z
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column):  # type: ignore[no-untyped-def]
     """Return the row and the column, on the whole detector, where a pixel's material was seen before it moved.
 
-    And by how much it is stretched along the ray.
+    And how many times as long a piece of it is along the ray as before, by which the path through it grew.
     """
     n = len(heights)
     sx, sy, sz = rays[0]
@@ -269,14 +267,17 @@ def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column
     while k + 2 < n and heights[k + 1] < z:
         k += 1
     ux, uy, uz = _moved(maps[k], 0, x, y, z), _moved(maps[k], 1, x, y, z), _moved(maps[k], 2, x, y, z)
-    stretch = _stretch(maps[k], bx, by, bz)
+    gx, gy, gz = _turned(maps[k], 0, bx, by, bz), _turned(maps[k], 1, bx, by, bz), _turned(maps[k], 2, bx, by, bz)
     if n > 1:
         s = min(max((z - heights[k]) / (heights[k + 1] - heights[k]), 0.0), 1.0)
         m = maps[k + 1]
         ux += s * (_moved(m, 0, x, y, z) - ux)
         uy += s * (_moved(m, 1, x, y, z) - uy)
         uz += s * (_moved(m, 2, x, y, z) - uz)
-        stretch += s * (_stretch(m, bx, by, bz) - stretch)
+        gx += s * (_turned(m, 0, bx, by, bz) - gx)
+        gy += s * (_turned(m, 1, bx, by, bz) - gy)
+        gz += s * (_turned(m, 2, bx, by, bz) - gz)
+    longer = 1 / np.sqrt((bx - gx) ** 2 + (by - gy) ** 2 + (bz - gz) ** 2)
     # seen from stage angle theta + delta: turned by delta, it is seen alike from theta
     x, y, z = x - ux, y - uy, z - uz
     cos, sin = turn
@@ -284,7 +285,7 @@ def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column
     scale = depth / (x * normal[0] + y * normal[1] + z * normal[2])
     x, y, z = sx + scale * x - ox, sy + scale * y - oy, sz + scale * z - oz
     row, column = (x * dx + y * dy + z * dz) / pitch2 + corner[0], (x * rx + y * ry + z * rz) / pitch2 + corner[1]
-    return row, column, stretch
+    return row, column, longer
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -304,8 +305,8 @@ def _register(field, rays, delta, heights, maps, corner, out):  # type: ignore[n
     turn = np.cos(delta), np.sin(delta)
     for row in prange(out.shape[0]):
         for column in range(out.shape[1]):
-            r, c, stretch = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)
-            out[row, column] = (1 + stretch) * _cubic(field, r, c)
+            r, c, longer = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)
+            out[row, column] = longer * _cubic(field, r, c)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -315,4 +316,4 @@ def _find_places(rays, delta, heights, maps, corner, out):  # type: ignore[no-un
     turn = np.cos(delta), np.sin(delta)
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
-            out[row, column] = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)[:2]
+            out[row, column] = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)

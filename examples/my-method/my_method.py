@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from pdvc.experiment import Experiment
+from pdvc.gauss_newton import GaussNewton
 from pdvc.history import Force, Polynomial
 from pdvc.measurement import Measurement
-from pdvc.options import MeasureOptions
+from pdvc.options import MeasureOptions, StageOptions
 from pdvc.protocol import measure
 from validation.methods.registry import Method
 
@@ -19,7 +20,9 @@ def follows_force(experiment: Experiment) -> Measurement:
     """
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(experiment.test.force_N, 2, mode="edge"), 5)
     quiet = replace(experiment, test=replace(experiment.test, force_N=np.median(windows, axis=1)))
-    return measure(quiet, MeasureOptions(time=(Force(), Polynomial(degree=0)), sections=6))
+    stages = (StageOptions(scale=2, solver=GaussNewton()), StageOptions(scale=1, solver=GaussNewton()))
+    options = MeasureOptions(time=(Force(), Polynomial(degree=0)), sections=6, deformation=stages)
+    return measure(quiet, options)
 
 
 FOLLOWS_FORCE = Method(
