@@ -74,7 +74,7 @@ def test_classical_dvc_is_told_to_use_scans_and_measures_with_the_default_sectio
     method.measure("an experiment")
     ((experiment, options),) = handed
     assert experiment == "an experiment"
-    assert (options.sections, options.section_motions) == (21, MeasureOptions().section_motions)
+    assert (options.sections, options.section_motions) == (15, MeasureOptions().section_motions)
 
 
 def options_of(name, monkeypatch, *, rows=238, steps=127):

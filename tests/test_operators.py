@@ -227,7 +227,8 @@ def test_spreading_is_the_adjoint_of_registration(scanner, angle, seed, size, be
 def test_fields_whose_rows_meet_different_sections_are_spread_section_by_section(seed, size):
     """Each section's part of a field goes where a field of that section alone goes."""
     rng, window, whole = np.random.default_rng(seed), (9, 7), (14, 12)
-    places = np.stack(np.indices(window) + 2.0, axis=-1) + size * rng.normal(size=(*window, 2))
+    places = np.ones((*window, 3))
+    places[..., :2] = np.stack(np.indices(window) + 2.0, axis=-1) + size * rng.normal(size=(*window, 2))
     field = Sensitivities(
         values=rng.normal(size=(*window, 4)).astype(np.float32), first=rng.integers(0, 4, window[0]), motions=2
     )

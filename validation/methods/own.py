@@ -21,7 +21,9 @@ def _direct(scale: int | Literal["coarse"]) -> StageOptions:
 
 
 _SECTION_STAGES = (_direct(2), _direct(1))
-_DIRECT = MeasureOptions(rigid=(_direct("coarse"), _direct(2)), deformation=_SECTION_STAGES)
+_SECTIONS = 15
+"""As in the paper: without neighbours in time, fewer sections are known better."""
+_DIRECT = MeasureOptions(sections=_SECTIONS, rigid=(_direct("coarse"), _direct(2)), deformation=_SECTION_STAGES)
 
 
 def pgd(experiment: Experiment) -> Measurement:
@@ -53,6 +55,7 @@ def each_step(experiment: Experiment) -> Measurement:
     coarsest = max(scale for scale in (2, 4, 8, 16) if scale == 2 or experiment.geometry.rows >= 25 * scale)
     scales = [scale for scale in (16, 8, 4, 2) if scale <= coarsest]
     options = MeasureOptions(
+        sections=_SECTIONS,
         time=(Steps(),),
         rigid=tuple(_direct(scale) for scale in scales),
         deformation=_SECTION_STAGES,
