@@ -19,7 +19,6 @@ from scipy import fft, ndimage
 
 from pdvc.experiment import Experiment
 from pdvc.radiographs import Calibration, binned, grey_levels
-from pdvc.systematic import neighbouring_views
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -52,6 +51,33 @@ class Likeness:
     """(looked at,) the largest correlation after turning the radiograph upside down."""
     mirrored: Floats
     """(looked at,) the largest correlation after exchanging left and right."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Neighbours:
+    """The two reference views next to each step's angle, and the share of the second."""
+
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    share: Floats
+
+
+def neighbouring_views(reference_rad: Floats, test_rad: Floats) -> Neighbours:
+    """Find the reference views on both sides of each test angle, over the turn's end too."""
+    turned = np.mod(reference_rad, 2 * np.pi)
+    order = np.argsort(turned, kind="stable")
+    ring = turned[order]
+    at = np.mod(test_rad, 2 * np.pi)
+    after = np.searchsorted(ring, at - 1e-9)
+    first = order[(after - 1) % len(ring)]
+    second = order[after % len(ring)]
+    gap = np.mod(turned[second] - turned[first], 2 * np.pi)
+    way = np.mod(at - turned[first], 2 * np.pi)
+    share = np.where(gap > 0, np.minimum(way / np.where(gap > 0, gap, 1), 1), 0)
+    # a step at a reference angle takes that view alone
+    share = np.where(share > 1 - 1e-6, 1.0, np.where(share < 1e-6, 0.0, share))
+    first, second = np.where(share == 1, second, first), np.where(share == 0, first, second)
+    return Neighbours(first=first, second=second, share=np.where(first == second, 0.0, share))
 
 
 def likeness(experiment: Experiment, calibration: Calibration) -> Likeness:

@@ -34,7 +34,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pdvc.equations import Images, joined
-from pdvc.measurement import ResidualTests
 from pdvc.progress import Progress, silent
 from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import noise_overlap, smoothed
@@ -82,10 +81,10 @@ def known_from_residual(rms: float, window: tuple[int, int], detector: tuple[int
     Interpolating leaves a share of a view's variance, on average over places between pixels and between views; the
     filter leaves what `noise_overlap` tells.
     """
-    between = np.linspace(0, 1, 101)
-    left = float(np.mean(np.sum(np.square(taps(between, np.zeros(101, dtype=np.int64))), axis=0))) ** 2 / np.sqrt(
-        np.pi
-    )
+    weights = taps(np.linspace(0, 1, 101), np.zeros(101, dtype=np.int64))
+    along_an_axis = float((weights**2).sum(axis=0).mean())
+    # 1 / sqrt(pi) is left by a mean over views half as wide as their spacing
+    left = along_an_axis**2 / np.sqrt(np.pi)
     variance = rms**2 / noise_overlap(smooth_px)[0] ** 2 / (1 + left)
 
     def uniform(shape: tuple[int, ...]) -> ImageNoise:
@@ -101,13 +100,13 @@ def known_from_residual(rms: float, window: tuple[int, int], detector: tuple[int
 
 @dataclass(frozen=True, kw_only=True)
 class Propagated:
-    """The covariance V of h, and whether the residual is that noise."""
+    """The covariance V of h."""
 
     parts: Mapping[str, Floats]
-    """By source, ``radiographs``, ``views`` and ``flats``: (function * unknown, function * unknown), or (function,
+    """By source, `SOURCES` and ``systematic``, that of e: (function * unknown, function * unknown), or (function,
     unknown, unknown) where functions share no step."""
     own: Mapping[str, Floats]
-    """The same of each step's c alone (step, unknown, unknown)."""
+    """The same of each step's c alone, by `SOURCES` (step, unknown, unknown)."""
     systematic: Floats
     """What one standard deviation of the subtracted systematic residual does to c (step, unknown), at all steps alike;
     zero where none is subtracted."""
@@ -150,7 +149,7 @@ def propagate(
         weighted = replace(field, values=field.values * weight[..., None])
         places = systematic.places(t, images.rays[t], basis, amplitude[t], images.voxel_mm)
         moved = _spread(weighted, places, noise.flat.shape)
-        view = _mean(noise, sight.of_step(t))
+        view = mean_of_views(noise, sight.of_step(t))
         own["radiographs"][t] = product(weighted, weighted, image.variance, unknowns)
         own["views"][t] = product(moved, moved, view.variance, unknowns)
         if images.systematic is not None:
@@ -183,28 +182,6 @@ def propagate(
     return Propagated(parts=joint, own=own, systematic=believed)
 
 
-def residual_tests(
-    images: Images,
-    systematic: Systematic,
-    basis: SectionBasis,
-    amplitude: Floats,
-    noise: Noise,
-    residual: Image,
-    unknowns: int,
-) -> ResidualTests:
-    """Return whether the residual (step, row, column), grey levels, of a solution is the noise that is expected.
-
-    At amplitudes (step, section, motion), voxels; `unknowns` of all steps were found.
-    """
-    tests = _Tests(noise_overlap(noise.smooth_px))
-    sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
-    for t, rays in enumerate(images.rays):
-        places = systematic.places(t, rays, basis, amplitude[t], images.voxel_mm)
-        used, view = images.weight[t % len(images.weight)] > 0, _mean(noise, sight.of_step(t))
-        tests.add(residual[t], used, noise.step(t), view, noise.flat, places, systematic.corner)
-    return tests.result(unknowns)
-
-
 def separate(time_functions: Floats) -> bool:
     """Return whether each step has a function of its own, so that nothing joins the steps."""
     filled = time_functions != 0
@@ -230,7 +207,7 @@ def _company(sight: Sight, apart: bool) -> dict[int, dict[int, dict[int, float]]
     return found
 
 
-def _mean(noise: Noise, shares: Mapping[int, float]) -> ImageNoise:
+def mean_of_views(noise: Noise, shares: Mapping[int, float]) -> ImageNoise:
     """Return the noise of a mean over views, by their shares."""
     found = [(np.float32(share), noise.view(view)) for view, share in shares.items()]
     return ImageNoise(
@@ -329,90 +306,6 @@ class Pile:
         return total.reshape(functions * unknowns, functions * unknowns)
 
 
-class _Tests:
-    """The sums that tell whether the residual is the noise that is expected."""
-
-    def __init__(self, overlap: Floats) -> None:
-        self._overlap = overlap
-        self._chi2, self._pixels = 0.0, 0
-        self._seen, self._expected, self._pairs = np.zeros(2), np.zeros(2), np.zeros(2)
-
-    def add(
-        self,
-        residual: Image,
-        used: NDArray[np.bool_],
-        image: ImageNoise,
-        view: ImageNoise,
-        flat: Image,
-        places: Floats,
-        corner: tuple[int, int],
-    ) -> None:
-        """Add a step: its radiograph's noise over the window, its views' and the flats' over the detector.
-
-        Noise varies little from pixel to pixel, so that it is taken from the pixel above and left of a place.
-        """
-        c = self._overlap
-        at = [np.clip(places[..., k].astype(int), 0, flat.shape[k] - 2) for k in range(2)]
-        weights = [taps(places[..., k], at[k]) for k in range(2)]
-
-        def lagged(tap: Floats, lag: int) -> Floats:
-            """Return the covariance along an axis of what is interpolated so, with the same `lag` pixels on."""
-            between = np.array([[_of_lag(c, m + lag - n) for n in range(4)] for m in range(4)])
-            return np.asarray(np.einsum("m...,mn,n...->...", tap, between, tap, optimize=True))
-
-        same, following = [lagged(each, 0) for each in weights], [lagged(each, 1) for each in weights]
-        pixel = np.indices(residual.shape) + np.array(corner)[:, None, None]
-
-        def flats(shift: int) -> list[Floats]:
-            """Return the covariance of a pixel with its place, moved by a shift, along each axis."""
-            return [
-                np.asarray(
-                    sum(weights[k][m] * _of_lag(c, at[k] - 1 + m + shift - pixel[k]) for m in range(4)), dtype=float
-                )
-                for k in range(2)
-            ]
-
-        (down, across), before, after = flats(0), flats(-1), flats(1)
-        here = flat[pixel[0], pixel[1]]
-        there, slope = flat[at[0], at[1]], view.slope[at[0], at[1]]
-        known = image.variance + image.slope**2 * here
-        moved = view.variance[at[0], at[1]] + slope**2 * there
-        # the flats are the same in both
-        twice = 2 * image.slope * slope * np.sqrt(here * there)
-        variance = c[0] ** 2 * known + same[0] * same[1] * moved - twice * down * across
-        white = np.where(used, residual / np.sqrt(variance), 0)
-        self._chi2 += float((white**2).sum())
-        self._pixels += int(used.sum())
-        shared = (
-            c[1] * c[0] * known + following[0] * same[1] * moved - twice * (before[0] + after[0]) / 2 * across,
-            c[0] * c[1] * known + same[0] * following[1] * moved - twice * down * (before[1] + after[1]) / 2,
-        )
-        for axis in range(2):
-            first, second = [slice(None)] * 2, [slice(None)] * 2
-            first[axis], second[axis] = slice(None, -1), slice(1, None)
-            pairs = used[tuple(first)] & used[tuple(second)]
-            self._seen[axis] += float((white[tuple(first)] * white[tuple(second)]).sum())
-            self._expected[axis] += float((shared[axis] / variance)[tuple(first)][pairs].sum())
-            self._pairs[axis] += int(pairs.sum())
-
-    def result(self, unknowns: int) -> ResidualTests:
-        """Return the tests, of a solution with so many unknowns."""
-        pairs, mean_square = np.maximum(self._pairs, 1), max(self._chi2 / max(self._pixels, 1), 1e-300)
-        seen, expected = self._seen / pairs / mean_square, self._expected / pairs
-        return ResidualTests(
-            chi2_reduced=self._chi2 / max(self._pixels - unknowns, 1),
-            lag1_row=float(seen[0]),
-            lag1_column=float(seen[1]),
-            lag1_row_expected=float(expected[0]),
-            lag1_column_expected=float(expected[1]),
-        )
-
-
-def _of_lag(overlap: Floats, lag: NDArray[np.int64] | int) -> Floats:
-    """Return the covariance of filtered noise at a lag of pixels along an axis; zero beyond the filter's reach."""
-    return np.asarray(overlap[np.minimum(np.abs(lag), len(overlap) - 1)])
-
-
 def overlaid(fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]], shape: tuple[int, ...]) -> Sensitivities:
     """Return the sum, over a detector of `shape`, of fields times factors (row, column), from their first pixel on."""
     motions = fields[0][0].motions
@@ -421,12 +314,19 @@ def overlaid(fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]], sha
         rows = slice(row, row + len(field.values))
         low[rows] = np.minimum(low[rows], field.first)
         high[rows] = np.maximum(high[rows], field.first + field.values.shape[2] // motions)
-    low = np.where(high > 0, low, 0)
-    values = np.zeros((*shape, max(int((high - low).max()), 1) * motions), dtype=np.float32)
+    low, values = _blank(low, high, shape, motions)
     for field, factor, (row, column) in fields:
         first = low[row : row + len(field.values)]
         _add_to(values, field.values, (field.first - first) * motions, factor, row, column)
     return Sensitivities(values=values, first=low, motions=motions)
+
+
+def _blank(
+    low: NDArray[np.int64], high: NDArray[np.int64], shape: tuple[int, ...], motions: int
+) -> tuple[NDArray[np.int64], Image]:
+    """Return the first section of each row, and zeros for the sections from `low` to `high` (row,), 0 for none."""
+    low = np.where(high > 0, low, 0)
+    return low, np.zeros((*shape, max(int((high - low).max()), 1) * motions), dtype=np.float32)
 
 
 def _spread(field: Sensitivities, places: Floats, shape: tuple[int, ...]) -> Sensitivities:
@@ -438,8 +338,7 @@ def _spread(field: Sensitivities, places: Floats, shape: tuple[int, ...]) -> Sen
     for first, start, end in zip(field.first, top, bottom, strict=True):
         low[start : end + 1] = np.minimum(low[start : end + 1], first)
         high[start : end + 1] = np.maximum(high[start : end + 1], first + span)
-    low = np.where(high > 0, low, 0)
-    values = np.zeros((*shape, max(int((high - low).max()), 1) * field.motions), dtype=np.float32)
+    low, values = _blank(low, high, shape, field.motions)
     _scatter(field.values, (field.first[:, None] - low) * field.motions, places, values)
     return Sensitivities(values=values, first=low, motions=field.motions)
 

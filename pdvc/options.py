@@ -39,7 +39,7 @@ class StageOptions(Settings):
     scale: Scale | Literal["coarse"] = 1
     """pixels binned into one; coarse: the largest power of two that leaves about a hundred rows"""
     solver: Solver = Pgd()
-    """pgd or gauss-newton, each with its own limits"""
+    """pgd, gauss-newton or smoother, each with its own limits"""
 
     def at(self, geometry: ConeBeam) -> ResolvedStage:
         """Return the stage with its scale as a number, for a detector."""

@@ -101,18 +101,11 @@ class Planner:
         self._noise = noise
         self._images = prepared.images
         self._systematic = prepared.systematic
-        self._corner = prepared.systematic.corner
         left = noise_overlap(noise.smooth_px)[0] ** 2
         self._variance = left * float(
             np.mean([noise.step(t).variance.mean() for t in range(len(self._reference_rad))])
         )
         self._worked_out: dict[str, tuple[Floats, Floats, Floats, Floats]] = {}
-
-    @property
-    def _window(self) -> tuple[slice, slice]:
-        """Return the used rows and columns of the detector."""
-        (row, column), (rows, columns) = self._corner, self._systematic.shape
-        return slice(row, row + rows), slice(column, column + columns)
 
     @property
     def heights_mm(self) -> tuple[float, float]:
@@ -181,7 +174,7 @@ class Planner:
         for k, field in enumerate(self._fields(images, basis)):
             view = int(views[k])
             step = self._noise.step(view)
-            left = self._systematic.left(view)[self._window]
+            left = self._systematic.left(view)[self._systematic.window]
             believed[k] = BELIEF * adjoint(field, left, matrix.shape[1])
             noise[k] = product(field, field, step.variance, matrix.shape[1])
             for other, seen in alike[view]:
@@ -194,7 +187,7 @@ class Planner:
             else:
                 del alike[view]
             for t in np.flatnonzero(turn == k):
-                moved = [(field, -step.slope, self._corner), (field, step.slope, was[t])]
+                moved = [(field, -step.slope, self._systematic.corner), (field, step.slope, was[t])]
                 pile.add(int(t), overlaid(moved, self._noise.flat.shape))
         of_steps, of_views = joined(noise[turn], functions), joined(noise, shared)
         covariance = of_steps + of_views + between.reshape(of_views.shape)
@@ -212,7 +205,7 @@ class Planner:
         geometry, window = self._setup.geometry, self._setup.window
         turned = test.moved_mm[:, None] @ beam_frame(test.angle_rad).transpose(0, 2, 1)
         across, up = (turned[:, 0, k] / geometry.voxel_mm for k in range(2))
-        row, column = self._corner
+        row, column = self._systematic.corner
         rows, columns = window[1] - window[0], window[3] - window[2]
         top = np.clip(np.round(row + up), 0, geometry.rows - rows).astype(int)
         left = np.clip(np.round(column - across), 0, geometry.columns - columns).astype(int)

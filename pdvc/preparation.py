@@ -253,11 +253,10 @@ def noise_of(setup: Setup, prepared: Prepared) -> Noise | None:
     if noise is None:
         return None
     known: DetectorNoise = noise
-    (row, column), (rows, columns) = prepared.systematic.corner, prepared.systematic.shape
+    window = prepared.systematic.window
 
     def step(t: int) -> ImageNoise:
         variance, slope = grey_noise(experiment.test.counts[t], calibration, known)
-        window = (slice(row, row + rows), slice(column, column + columns))
         return ImageNoise(variance=variance[window], slope=slope[window])
 
     @lru_cache(maxsize=_VIEWS_AT_HAND)
@@ -314,9 +313,7 @@ def snr_reprojection(prepared: Prepared, basis: SectionBasis, amplitude: Floats)
     """
     systematic, images = prepared.systematic, prepared.images
     sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
-    (row, column), (rows, columns) = systematic.corner, systematic.shape
-    window = (slice(row, row + rows), slice(column, column + columns))
-    used = np.ones((rows, columns), dtype=bool)
+    window, used = systematic.window, np.ones(systematic.shape, dtype=bool)
     views = np.unique(sight.views[sight.share > 0]).tolist()
     return np.array([snr_db(prepared.view(i)[window], systematic.left(i)[window], used) for i in views])
 

@@ -46,7 +46,6 @@ from pdvc.banded import Blocks, Factor, factored
 from pdvc.sections import CONTRACTION, RIGID, TRANSLATION_Z, SectionBasis
 
 Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 FITTED_MODES = 12
 """Modes along z of each motion, at most, when deviations are found: how they fall off tells of all others."""
@@ -131,7 +130,9 @@ class StateSpace:
         followed = [k for k in range(len(RIGID)) if basis.reproduces(replace(single, motions=(RIGID[k],)))]
         each = [replace(single, motions=(RIGID[k],)) for k in followed]
         rigid = np.stack([basis.reproduced(np.ones((1, 1)), one).ravel() for one in each], axis=1)
-        modes, self._value = _modes(basis.height_mm, sections if most_modes is None else most_modes)
+        modes, value = _modes(basis.height_mm, sections if most_modes is None else most_modes)
+        self.log_value = np.log(value / value[0])
+        """log(l_j / l_0) of the modes."""
         own = np.einsum("jm,kl->jklm", modes, np.eye(motions)).reshape(sections * motions, -1)
         if contraction_of_strain and {CONTRACTION, TRANSLATION_Z} <= set(basis.motions):
             axial, contraction = basis.motions.index(TRANSLATION_Z), basis.motions.index(CONTRACTION)
@@ -141,9 +142,7 @@ class StateSpace:
         self.to_amplitude = np.concatenate([rigid, own], axis=1)
         """Phi (unknown, state)."""
         self.rigid = len(followed)
-        self.group = np.concatenate(
-            [np.arange(self.rigid), self.rigid + np.repeat(np.arange(motions), len(self._value))]
-        )
+        self.group = np.concatenate([np.arange(self.rigid), self.rigid + np.repeat(np.arange(motions), len(value))])
         """Which deviation each state has."""
         self.trend = np.zeros((trend.shape[1], self.to_amplitude.shape[1], len(trend) * self.rigid))
         for i, function in enumerate(trend):
@@ -152,7 +151,8 @@ class StateSpace:
         gap = _gaps(time_s)
         self._second = _second_differences(gap)
         self._gap = (gap[1:] + gap[:-1]) / 2
-        self._ends = np.unique([0, len(time_s) - 1])
+        self.ends = np.unique([0, len(time_s) - 1])
+        """The first and the last step."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -179,8 +179,7 @@ class StateSpace:
 
     def relative(self, deviations: Deviations) -> Floats:
         """Return the variance of each state over that of its group's first mode (state,)."""
-        log_value = np.log(self._value / self._value[0])
-        own = np.exp(deviations.roughness[:, None] * log_value).ravel()
+        own = np.exp(deviations.roughness[:, None] * self.log_value).ravel()
         return np.concatenate([np.ones(self.rigid), own])
 
     def bend_variance(self, deviations: Deviations) -> Floats:
@@ -208,7 +207,7 @@ class StateSpace:
             near[t, i, i] += a * b * weight
             near[t + 1, i, i] += b * c * weight
             far[t, i, i] += a * c * weight
-        for t in self._ends:
+        for t in self.ends:
             own[t, i, i] += 1 / self.end_variance(deviations)
         return Blocks(own=own, next=near, after=far)
 
@@ -226,18 +225,8 @@ class StateSpace:
 
     def log_prior(self, deviations: Deviations) -> float:
         """Return the logarithm of the determinant of the prior's precision, up to a constant."""
-        ends = len(self._ends) * np.log(self.end_variance(deviations)).sum()
+        ends = len(self.ends) * np.log(self.end_variance(deviations)).sum()
         return -float(np.log(self.bend_variance(deviations)).sum() + ends)
-
-    @property
-    def ends(self) -> Indices:
-        """Return the first and the last step."""
-        return self._ends
-
-    @property
-    def log_value(self) -> Floats:
-        """Return log(l_j / l_0) of the modes."""
-        return np.asarray(np.log(self._value / self._value[0]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,10 +252,10 @@ class Process:
     def __init__(self, space: StateSpace, seen: Seen) -> None:
         """Take in what the radiographs tell."""
         self.space, self.seen = space, seen
-        design = seen.design @ space.to_amplitude
-        information = design.transpose(0, 2, 1) @ design
+        self._design = seen.design @ space.to_amplitude
+        information = self._design.transpose(0, 2, 1) @ self._design
         self._information = (information + information.transpose(0, 2, 1)) / 2
-        self._vector = np.einsum("tnm,tn->tm", design, seen.data)
+        self._vector = np.einsum("tnm,tn->tm", self._design, seen.data)
         self._of_trend = self._information @ space.trend
 
     def smoothed(self, deviations: Deviations) -> Smoothed:
@@ -307,8 +296,7 @@ class Process:
     def response(self, smoothed: Smoothed, deviations: Deviations, noise: Floats) -> Floats:
         """Return what errors of the data y (step, unknown, draw) do to the amplitudes (the same), voxels."""
         space = self.space
-        to_state = (self.seen.design @ space.to_amplitude).transpose(0, 2, 1) / deviations.misfit[:, None, None]
-        vector = to_state @ noise
+        vector = self._design.transpose(0, 2, 1) / deviations.misfit[:, None, None] @ noise
         found = smoothed.factor.solved(vector)
         of_data = np.einsum("tmp,tmd->pd", space.trend - smoothed.held, vector)
         p = smoothed.trend_covariance @ of_data

@@ -24,10 +24,11 @@ from pdvc.equations import Equations, check_size, linearise, residuals
 from pdvc.experiment import Experiment
 from pdvc.history import settled
 from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Stage
-from pdvc.noise import Noise, Propagated, known_from_residual, propagate, residual_tests
+from pdvc.noise import Noise, Propagated, known_from_residual, propagate
 from pdvc.options import DEFAULT, MeasureOptions, ResolvedStage, check_discarded
 from pdvc.preparation import Prepared, noise_of, prepare, snr_of, snr_reprojection
 from pdvc.progress import Progress, silent
+from pdvc.residual_tests import residual_tests
 from pdvc.result_checks import check_finite, doubts_of_result
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, set_up

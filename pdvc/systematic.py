@@ -39,33 +39,6 @@ REACH = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Neighbours:
-    """The two reference views next to each step's angle, and the share of the second."""
-
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
-    share: Floats
-
-
-def neighbouring_views(reference_rad: Floats, test_rad: Floats) -> Neighbours:
-    """Find the reference views on both sides of each test angle, over the turn's end too."""
-    turned = np.mod(reference_rad, 2 * np.pi)
-    order = np.argsort(turned, kind="stable")
-    ring = turned[order]
-    at = np.mod(test_rad, 2 * np.pi)
-    after = np.searchsorted(ring, at - 1e-9)
-    first = order[(after - 1) % len(ring)]
-    second = order[after % len(ring)]
-    gap = np.mod(turned[second] - turned[first], 2 * np.pi)
-    way = np.mod(at - turned[first], 2 * np.pi)
-    share = np.where(gap > 0, np.minimum(way / np.where(gap > 0, gap, 1), 1), 0)
-    # a step at a reference angle takes that view alone
-    share = np.where(share > 1 - 1e-6, 1.0, np.where(share < 1e-6, 0.0, share))
-    first, second = np.where(share == 1, second, first), np.where(share == 0, first, second)
-    return Neighbours(first=first, second=second, share=np.where(first == second, 0.0, share))
-
-
-@dataclass(frozen=True, kw_only=True)
 class Sight:
     """The directions in which steps look through the sample as it was at rest, and the views that show it so."""
 
@@ -127,6 +100,12 @@ class Systematic:
     """Rows and columns of the whole detector."""
     width_rad: float
     """Standard deviation of the mean over views, rad."""
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Return the used rows and columns of the whole detector."""
+        (row, column), (rows, columns) = self.corner, self.shape
+        return slice(row, row + rows), slice(column, column + columns)
 
     def looked_along(
         self, steps: slice, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float
@@ -234,15 +213,15 @@ def _cubic(field, r, c):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
-    """Return coordinate i of an affine map."""
-    return m[i, 0] * x + m[i, 1] * y + m[i, 2] * z + m[i, 3]
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
 def _turned(m, i, x, y, z):  # type: ignore[no-untyped-def]
     """Return component i of a vector under the linear part of an affine map."""
     return m[i, 0] * x + m[i, 1] * y + m[i, 2] * z
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
+    """Return coordinate i of an affine map."""
+    return _turned(m, i, x, y, z) + m[i, 3]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -9,11 +9,12 @@ import pytest
 
 from pdvc.equations import linearise
 from pdvc.measurement import ResidualTests
-from pdvc.noise import ImageNoise, Noise, Propagated, known_from_residual, propagate, residual_tests, separate
+from pdvc.noise import ImageNoise, Noise, Propagated, known_from_residual, propagate, separate
 from pdvc.prior import Prior
 from pdvc.projection import sensitivities
 from pdvc.radiographs import smoothed
 from pdvc.rays import ray_vectors
+from pdvc.residual_tests import residual_tests
 from pdvc.systematic import Systematic
 from pdvc.uncertainty import posterior
 from tests.small_case import ANGLES, SCANNER, SECTIONS, SHAPE, STEPS, VOXEL_MM, motion, radiographs, time_functions

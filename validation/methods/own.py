@@ -22,7 +22,7 @@ def _direct(scale: int | Literal["coarse"]) -> StageOptions:
 
 _SECTION_STAGES = (_direct(2), _direct(1))
 _SECTIONS = 15
-"""As in the paper: without neighbours in time, fewer sections are known better."""
+"""As in the paper, for the methods beside the default one."""
 _DIRECT = MeasureOptions(sections=_SECTIONS, rigid=(_direct("coarse"), _direct(2)), deformation=_SECTION_STAGES)
 
 
@@ -37,7 +37,7 @@ def smoother(experiment: Experiment) -> Measurement:
 
 
 def gauss_newton(experiment: Experiment) -> Measurement:
-    """Measure by direct solves of all unknowns, from coarse to fine, with the default bases."""
+    """Measure by direct solves of all unknowns, from coarse to fine, with time functions and the paper's sections."""
     return measure(experiment, _DIRECT)
 
 
