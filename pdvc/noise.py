@@ -27,10 +27,11 @@ then an upper bound.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pdvc.equations import Images, joined
@@ -38,7 +39,8 @@ from pdvc.progress import Progress, silent
 from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import noise_overlap, smoothed
 from pdvc.sections import SectionBasis
-from pdvc.systematic import Sight, Systematic, first_pixel, keys_weights, taps
+from pdvc.sensitivity_sums import Pile, adjoint, overlaid, product, spread
+from pdvc.systematic import Sight, Systematic, taps
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -48,7 +50,7 @@ SOURCES = ("radiographs", "views", "flats")
 BELIEF = 0.1
 """Share of e that it may be wrong by, alike everywhere: what re-projection leaves of paths a little other than those
 of the reference scan is known no better."""
-_BLOCK_ROWS = 16
+_STEPS_AT_ONCE = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,35 +145,41 @@ def propagate(
     sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
     held: dict[int, Sensitivities] = {}
 
-    def add_step(t: int, field: Sensitivities) -> Sensitivities:
-        """Add what the step's own noise and the flats' do; return Y, which its views' noise needs."""
-        weight, image = images.weight[t % len(images.weight)], noise.step(t)
-        weighted = replace(field, values=field.values * weight[..., None])
-        places = systematic.places(t, images.rays[t], basis, amplitude[t], images.voxel_mm)
-        moved = _spread(weighted, places, noise.flat.shape)
-        view = mean_of_views(noise, sight.of_step(t))
-        own["radiographs"][t] = product(weighted, weighted, image.variance, unknowns)
-        own["views"][t] = product(moved, moved, view.variance, unknowns)
-        if images.systematic is not None:
-            one = slice(t, t + 1)
-            left = systematic.registered(one, images.rays[one], basis, amplitude[one], images.voxel_mm)[0]
-            believed[t] = BELIEF * adjoint(weighted, left, unknowns)
-        both = [(moved, view.slope, (0, 0)), (weighted, -image.slope, systematic.corner)]
-        shared = overlaid(both, noise.flat.shape)
-        own["flats"][t] = product(shared, shared, noise.flat, unknowns)
-        if pile is not None:
-            pile.add(t, shared)
-        return moved
+    def add_step(step: int, weighted: Sensitivities, left: Image | None) -> tuple[Sensitivities, Sensitivities]:
+        """Add what the step's own noise does; return Y, which its views' noise needs, and what the flats' needs."""
+        image, view = noise.step(step), mean_of_views(noise, sight.of_step(step))
+        places = systematic.places(step, images.rays[step], basis, amplitude[step], images.voxel_mm)
+        moved = spread(weighted, places, noise.flat.shape)
+        shared = overlaid([(moved, view.slope, (0, 0)), (weighted, -image.slope, systematic.corner)], noise.flat.shape)
+        own["radiographs"][step] = product(weighted, weighted, image.variance, unknowns)
+        own["views"][step] = product(moved, moved, view.variance, unknowns)
+        own["flats"][step] = product(shared, shared, noise.flat, unknowns)
+        if left is not None:
+            believed[step] = BELIEF * adjoint(weighted, left, unknowns)
+        return moved, shared
+
+    def add_pair(step: int, other: int, shares: Mapping[int, float]) -> None:
+        """Add what the noise of the views does that two steps both look along."""
+        variance = np.sum([share * noise.view(view).variance for view, share in shares.items()], axis=0)
+        pairs[step, other] = product(held[step], held[other], variance, unknowns)
 
     company = _company(sight, apart)
-    for done, (t, others) in enumerate(company.items()):
-        held[t] = add_step(t, _field(images, basis, amplitude, t))
-        for other, shares in others.items():
-            variance = np.sum([share * noise.view(view).variance for view, share in shares.items()], axis=0)
-            pairs[t, other] = product(held[t], held[other], variance, unknowns)
-        later = list(company.values())[done + 1 :]
-        held = {step: field for step, field in held.items() if any(step in known for known in later)}
-        progress("uncertainty", done + 1, len(amplitude))
+    order = list(company)
+    # rays are walked by all threads at once; what follows is one thread's work for each step
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        for done in range(0, len(order), _STEPS_AT_ONCE):
+            steps = order[done : done + _STEPS_AT_ONCE]
+            fields = _weighted(images, basis, amplitude, steps)
+            left = [_registered(images, basis, amplitude, t) for t in steps]
+            for t, (moved, shared) in zip(steps, pool.map(add_step, steps, fields, left), strict=True):
+                held[t] = moved
+                if pile is not None:
+                    pile.add(t, shared)
+            together = [(t, other, shares) for t in steps for other, shares in company[t].items()]
+            list(pool.map(add_pair, *zip(*together, strict=True))) if together else None
+            later = {other for t in order[done + len(steps) :] for other in company[t]}
+            held = {step: field for step, field in held.items() if step in later}
+            progress("uncertainty", done + len(steps), len(amplitude))
     joint = {
         "radiographs": _joined(own["radiographs"], {}, time_functions),
         "views": _joined(own["views"], pairs, time_functions),
@@ -216,29 +224,22 @@ def mean_of_views(noise: Noise, shares: Mapping[int, float]) -> ImageNoise:
     )
 
 
-def _field(images: Images, basis: SectionBasis, amplitude: Floats, step: int) -> Sensitivities:
-    """Return the sensitivities of a step."""
+def _weighted(images: Images, basis: SectionBasis, amplitude: Floats, steps: Sequence[int]) -> list[Sensitivities]:
+    """Return the sensitivities of steps, each pixel's times its weight."""
     shape = (images.grey.shape[1], images.grey.shape[2])
+    rays, there = images.rays[steps], amplitude[steps]
+    fields = sensitivities(images.volume, rays, shape, basis, there, voxel_mm=images.voxel_mm)
+    for t, field in zip(steps, fields, strict=True):
+        field.values[:] *= images.weight[t % len(images.weight)][..., None]
+    return fields
+
+
+def _registered(images: Images, basis: SectionBasis, amplitude: Floats, step: int) -> Image | None:
+    """Return e of a step, if it is subtracted."""
+    if images.systematic is None:
+        return None
     one = slice(step, step + 1)
-    return sensitivities(images.volume, images.rays[one], shape, basis, amplitude[one], voxel_mm=images.voxel_mm)[0]
-
-
-def product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns: int) -> Floats:
-    """Return sum_p one(p)^T v(p) other(p), (unknown, unknown), of two fields with variances v (row, column)."""
-    result = np.zeros((unknowns, unknowns))
-    offsets = one.first * one.motions, other.first * other.motions
-    _add_product(one.values, offsets[0], other.values, offsets[1], variance, result)
-    return result
-
-
-def adjoint(field: Sensitivities, image: Image, unknowns: int) -> Floats:
-    """Return sum_p field(p) image(p), (unknown,)."""
-    of_rows = np.einsum("rck,rc->rk", field.values, image, dtype=float)
-    # the last sections may have room beyond
-    found = np.zeros(unknowns + field.values.shape[2])
-    for first, row in zip(field.first * field.motions, of_rows, strict=True):
-        found[first : first + len(row)] += row
-    return found[:unknowns]
+    return np.asarray(images.systematic.registered(one, images.rays[one], basis, amplitude[one], images.voxel_mm)[0])
 
 
 def _joined(own: Floats, pairs: Mapping[tuple[int, int], Floats], time_functions: Floats) -> Floats:
@@ -257,175 +258,3 @@ def _joined(own: Floats, pairs: Mapping[tuple[int, int], Floats], time_functions
         apart = joined(np.stack(list(pairs.values())), time_functions[:, t], time_functions[:, other])
         total += apart + apart.T
     return total
-
-
-class Pile:
-    """The sums z = sum_t sigma(t) (x) field(t) in each pixel of the detector: what a noise meets that all share."""
-
-    def __init__(self, shape: tuple[int, ...], time_functions: Floats, motions: int) -> None:
-        """Begin with nothing on a detector of `shape`, for time functions (function, step)."""
-        self._shape = shape
-        self._functions = time_functions.astype(np.float32)
-        self._motions = motions
-        self._first: dict[int, int] = {}
-        self._blocks: dict[int, Image] = {}
-
-    def add(self, step: int, field: Sensitivities) -> None:
-        """Add a step's field over the detector."""
-        for block in range((len(field.values) - 1) // _BLOCK_ROWS + 1):
-            rows = slice(block * _BLOCK_ROWS, min((block + 1) * _BLOCK_ROWS, len(field.values)))
-            z, first = self._room_for(block, field, rows)
-            offset = (field.first[rows] - first) * self._motions
-            _pile_up(z, field.values[rows], offset, self._functions[:, step])
-
-    def _room_for(self, block: int, field: Sensitivities, rows: slice) -> tuple[Image, int]:
-        """Return a block of pixels (row, column, function, section * motion), wide enough, and its first section."""
-        span = field.values.shape[2] // self._motions
-        low, high = int(field.first[rows].min()), int(field.first[rows].max()) + span
-        if block not in self._blocks:
-            shape = (_BLOCK_ROWS, self._shape[1], len(self._functions), (high - low) * self._motions)
-            self._blocks[block], self._first[block] = np.zeros(shape, dtype=np.float32), low
-        z, first = self._blocks[block], self._first[block]
-        below, above = max(first - low, 0), max(high - first - z.shape[3] // self._motions, 0)
-        if below or above:
-            z = np.pad(z, ((0, 0),) * 3 + ((below * self._motions, above * self._motions),))
-            self._blocks[block], self._first[block] = z, first - below
-        return self._blocks[block], self._first[block]
-
-    def covariance(self, variance: Image, unknowns: int) -> Floats:
-        """Return sum_p v(p) z(p) z(p)^T (function * unknown, function * unknown)."""
-        functions = len(self._functions)
-        total = np.zeros((functions, unknowns, functions, unknowns))
-        for block, z in self._blocks.items():
-            rows = slice(block * _BLOCK_ROWS, min((block + 1) * _BLOCK_ROWS, self._shape[0]))
-            flat = (z[: rows.stop - rows.start] * np.sqrt(variance[rows])[..., None, None]).reshape(-1, z[0, 0].size)
-            product = (flat.T @ flat).reshape(functions, z.shape[3], functions, z.shape[3])
-            i = self._first[block] * self._motions
-            size = min(z.shape[3], unknowns - i)
-            total[:, i : i + size, :, i : i + size] += product[:, :size, :, :size]
-        return total.reshape(functions * unknowns, functions * unknowns)
-
-
-def overlaid(fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]], shape: tuple[int, ...]) -> Sensitivities:
-    """Return the sum, over a detector of `shape`, of fields times factors (row, column), from their first pixel on."""
-    motions = fields[0][0].motions
-    low, high = np.full(shape[0], np.iinfo(np.int64).max), np.zeros(shape[0], dtype=np.int64)
-    for field, _, (row, _) in fields:
-        rows = slice(row, row + len(field.values))
-        low[rows] = np.minimum(low[rows], field.first)
-        high[rows] = np.maximum(high[rows], field.first + field.values.shape[2] // motions)
-    low, values = _blank(low, high, shape, motions)
-    for field, factor, (row, column) in fields:
-        first = low[row : row + len(field.values)]
-        _add_to(values, field.values, (field.first - first) * motions, factor, row, column)
-    return Sensitivities(values=values, first=low, motions=motions)
-
-
-def _blank(
-    low: NDArray[np.int64], high: NDArray[np.int64], shape: tuple[int, ...], motions: int
-) -> tuple[NDArray[np.int64], Image]:
-    """Return the first section of each row, and zeros for the sections from `low` to `high` (row,), 0 for none."""
-    low = np.where(high > 0, low, 0)
-    return low, np.zeros((*shape, max(int((high - low).max()), 1) * motions), dtype=np.float32)
-
-
-def _spread(field: Sensitivities, places: Floats, shape: tuple[int, ...]) -> Sensitivities:
-    """Return R^T of a field over the window: what each pixel of the detector takes part in."""
-    row = np.clip(np.floor(places[..., 0]).astype(np.int64), 0, shape[0] - 2)
-    top, bottom = np.maximum(row.min(axis=1) - 1, 0), np.minimum(row.max(axis=1) + 2, shape[0] - 1)
-    span = field.values.shape[2] // field.motions
-    low, high = np.full(shape[0], np.iinfo(np.int64).max), np.zeros(shape[0], dtype=np.int64)
-    for first, start, end in zip(field.first, top, bottom, strict=True):
-        low[start : end + 1] = np.minimum(low[start : end + 1], first)
-        high[start : end + 1] = np.maximum(high[start : end + 1], first + span)
-    low, values = _blank(low, high, shape, field.motions)
-    _scatter(field.values, (field.first[:, None] - low) * field.motions, places, values)
-    return Sensitivities(values=values, first=low, motions=field.motions)
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _add_product(one, first, other, second, variance, out):  # type: ignore[no-untyped-def]
-    """Add v one^T other of each pixel to `out`; `first` and `second` (row,) are where a row's values belong there.
-
-    A row may have room for sections beyond the last: these are left out.
-    """
-    for row in range(one.shape[0]):
-        # the pixels of a row share their sections: they are added up in a small matrix of their own, in double
-        # precision, which is added to its place in the large one when the row is done
-        i0, j0 = first[row], second[row]
-        height, width = min(one.shape[2], out.shape[0] - i0), min(other.shape[2], out.shape[1] - j0)
-        part = np.zeros((height, width))
-        for column in range(one.shape[1]):
-            for i in range(height):
-                w = variance[row, column] * one[row, column, i]
-                # most are zero: air, and sections of the row that this ray does not meet
-                if w != 0:
-                    for j in range(width):
-                        part[i, j] += w * other[row, column, j]
-        for i in range(height):
-            for j in range(width):
-                out[i0 + i, j0 + j] += part[i, j]
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
-    """Add each pixel's values to the 4 x 4 pixels that it was interpolated from; the adjoint of `systematic._cubic`.
-
-    One thread: neighbours add to the same pixels, and always in this order.
-    """
-    rows, columns = out.shape[0], out.shape[1]
-    for row in range(values.shape[0]):
-        for column in range(values.shape[1]):
-            # most carry something only inside the sample
-            empty = True
-            for k in range(values.shape[2]):
-                if values[row, column, k] != 0:
-                    empty = False
-                    break
-            r, c, longer = places[row, column]
-            i, j = first_pixel(r, rows), first_pixel(c, columns)
-            if empty or i < 0 or j < 0:
-                continue
-            down, right = keys_weights(r - i), keys_weights(c - j)
-            for m in range(4):
-                to_row = min(max(i - 1 + m, 0), rows - 1)
-                # where the sections of this row of the window begin in that row of the detector
-                start = offset[row, to_row]
-                for n in range(4):
-                    share = np.float32(longer * down[m] * right[n])
-                    if share != 0:
-                        to = out[to_row, min(max(j - 1 + n, 0), columns - 1)]
-                        for k in range(values.shape[2]):
-                            to[start + k] += share * values[row, column, k]
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _add_to(out, values, offset, factor, row0, column0):  # type: ignore[no-untyped-def]
-    """Add factor(p) values(p, k) to out, which starts row0 and column0 earlier, `offset` (row,) entries on."""
-    for row in range(values.shape[0]):
-        for column in range(values.shape[1]):
-            scale = factor[row, column]
-            for k in range(values.shape[2]):
-                # room beyond the last section is empty
-                if values[row, column, k] != 0:
-                    out[row0 + row, column0 + column, offset[row] + k] += scale * values[row, column, k]
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _pile_up(z, values, offset, sigma):  # type: ignore[no-untyped-def]
-    """Add sigma_f values(p, k) to z (row, column, f, k)."""
-    size = values.shape[2]
-    for row in range(values.shape[0]):
-        # unsigned: numba need not ask whether an index counts from the end
-        start = np.uint32(offset[row])
-        for column in range(values.shape[1]):
-            # pixels in air are left out
-            largest = np.float32(0)
-            for k in range(size):
-                largest = max(largest, abs(values[row, column, k]))
-            if largest == 0:
-                continue
-            for f in range(len(sigma)):
-                out = z[row, column, f]
-                for k in range(size):
-                    out[start + np.uint32(k)] += sigma[f] * values[row, column, k]

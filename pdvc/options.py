@@ -98,6 +98,8 @@ class MeasureOptions(Settings):
     """sharpen the reference views, for the volume only, by what interpolation blurs"""
     subtract_systematic: bool = True
     """subtract what re-projecting the volume leaves of the reference views, registered"""
+    remove_pattern: bool = True
+    """take from all images the detector's fixed pattern, where the flats' noise is known; before the last stage"""
     weighting: Literal["uniform", "noise"] = "uniform"
     """all pixels alike, as in the paper, or by the inverse of their noise"""
     prior_voxel: Annotated[float, Field(gt=0)] = 30.0
@@ -188,6 +190,7 @@ def paper_options() -> MeasureOptions:
         time=PAPER,
         smooth_px=0.0,
         sharpen=False,
+        remove_pattern=False,
         rigid=(StageOptions(scale=2, solver=Pgd(most_modes=8)),),
         deformation=(StageOptions(scale=1, solver=Pgd(most_modes=4)),),
     )

@@ -28,7 +28,7 @@ from pdvc.digest import digest
 from pdvc.equations import STEPS_AT_ONCE, Images, joined, linearise
 from pdvc.experiment import Experiment, Series
 from pdvc.history import time_basis
-from pdvc.noise import BELIEF, Pile, adjoint, overlaid, product
+from pdvc.noise import BELIEF
 from pdvc.options import MeasureOptions
 from pdvc.preparation import prepare, stated_noise
 from pdvc.progress import Progress, silent
@@ -36,6 +36,7 @@ from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import noise_overlap, smoothed
 from pdvc.rays import ray_vectors
 from pdvc.sections import SectionBasis
+from pdvc.sensitivity_sums import Pile, adjoint, overlaid, product
 from pdvc.setup import set_up
 from pdvc.uncertainty import sandwich
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 
@@ -57,6 +57,17 @@ class Prepared:
     """A reference view (row, column), grey levels, over the whole detector."""
     snr_noise_db: Floats
     noise_rms: float | None
+
+    def without(self, pattern: Image) -> Prepared:
+        """Return the same without a pattern (row, column), grey levels, that all images have in common."""
+        found = self.systematic
+        systematic = replace(found, left=lambda i: found.left(i) + pattern)
+        images = replace(
+            self.images,
+            grey=self.images.grey - pattern[found.window],
+            systematic=None if self.images.systematic is None else systematic,
+        )
+        return replace(self, images=images, systematic=systematic, view=lambda i: self.view(i) - pattern)
 
 
 def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:

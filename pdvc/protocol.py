@@ -26,6 +26,7 @@ from pdvc.history import settled
 from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Stage
 from pdvc.noise import Noise, Propagated, known_from_residual, propagate
 from pdvc.options import DEFAULT, MeasureOptions, ResolvedStage, check_discarded
+from pdvc.pattern import fixed_pattern
 from pdvc.preparation import Prepared, noise_of, prepare, snr_of, snr_reprojection
 from pdvc.progress import Progress, silent
 from pdvc.residual_tests import residual_tests
@@ -38,6 +39,7 @@ from pdvc.verdict import Stop, Verdict, explained_by
 from pdvc.volume import Volume
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
 
 
 def measure(
@@ -87,6 +89,7 @@ def _measured(
     moved = np.einsum("ft,fjk->tjk", time_functions, start)
     after_rigid = residuals(fine.images, sections, moved, progress=progress, task="rigid residual")
     found = solver.run("deformation", sections, setup.options.deformation, start, to_noise=True)
+    fine = solver.prepared[1]
     functions, amplitude = found.time_functions, np.einsum("ft,fjk->tjk", found.time_functions, found.coefficients)
     equations = solver.equations_at(sections, amplitude)
     propagating = time.perf_counter()
@@ -167,8 +170,10 @@ class _Protocol:
         self, setup: Setup, prepared: Mapping[int, Prepared], time_functions: Floats, progress: Progress
     ) -> None:
         self.stages: list[Stage] = []
+        self.prepared = dict(prepared)
+        """The images of each scale, as they are used now."""
         self._setup = setup
-        self._prepared = prepared
+        self._flats_left: Image | None = None
         self._time_functions = time_functions
         self._progress = progress
         self._last: tuple[Floats, Equations] | None = None
@@ -179,6 +184,8 @@ class _Protocol:
         """Solve the stages in turn from a start (function, section, motion), voxels; return where they end."""
         found = _Found(time_functions=self._time_functions, coefficients=start, known=None)
         for stage in stages:
+            if to_noise and stage is stages[-1]:
+                self._remove_pattern(basis, found)
             found = self._stage(name, basis, stage, found, to_noise)
         return found
 
@@ -211,23 +218,42 @@ class _Protocol:
         known = Known(covariance=kept["covariance"], by_source=sources) if "covariance" in kept else None
         return _Found(time_functions=functions, coefficients=kept["coefficients"], known=known)
 
+    def _remove_pattern(self, basis: SectionBasis, found: _Found) -> None:
+        """Take the detector's fixed pattern from all images of scale 1, if the options say so and noise is known."""
+        fine = self.prepared[1]
+        noise = noise_of(self._setup, fine)
+        if not self._setup.options.remove_pattern or noise is None:
+            return
+        known: Noise = noise
+
+        def pattern() -> dict[str, NDArray[np.float32]]:
+            amplitude = np.einsum("ft,fjk->tjk", found.time_functions, found.coefficients)
+            rho = residuals(fine.images, basis, amplitude, progress=self._progress, task="fixed pattern")
+            return vars(fixed_pattern(fine.images, fine.systematic, basis, amplitude, known, rho))
+
+        key = (self._setup.options, basis, found.time_functions, found.coefficients)
+        kept = self._setup.store.arrays("pattern", key, pattern)
+        self.prepared[1] = fine.without(kept["grey"])
+        self._flats_left = kept["left"]
+
     def equations_at(self, basis: SectionBasis, amplitude: Floats) -> Equations:
         """Return the equations of scale 1 at amplitudes: the last pass, unless that was in an earlier run."""
         if self._last is not None and np.array_equal(self._last[0], amplitude):
             return self._last[1]
-        return linearise(self._prepared[1].images, basis, amplitude, progress=self._progress, task="last pass")
+        return linearise(self.prepared[1].images, basis, amplitude, progress=self._progress, task="last pass")
 
     def noise(self, equations: Equations) -> Noise:
         """Return the noise of all images at scale 1; where the detector's is not stated, what the residual tells."""
-        fine = self._prepared[1]
-        return noise_of(self._setup, fine) or known_from_residual(
+        fine = self.prepared[1]
+        noise = noise_of(self._setup, fine) or known_from_residual(
             equations.rms, fine.systematic.shape, fine.systematic.detector, self._setup.options.smooth_px
         )
+        return noise if self._flats_left is None else replace(noise, flat=noise.flat * self._flats_left)
 
     def _solved(
         self, name: str, basis: SectionBasis, stage: ResolvedStage, functions: Floats, start: Floats, to_noise: bool
     ) -> Solution:
-        prepared, passes = self._prepared[stage.scale], 0
+        prepared, passes = self.prepared[stage.scale], 0
 
         def at(amplitude: Floats) -> Equations:
             nonlocal passes

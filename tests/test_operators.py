@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from pdvc.geometry import ConeBeam
-from pdvc.noise import _spread
 from pdvc.projection import Sensitivities, normal_equations, project, sensitivities
 from pdvc.radiographs import binned, coarsened, smoothed
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import _filtered, _ramp
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis, names_of
+from pdvc.sensitivity_sums import spread
 from pdvc.systematic import Systematic
 from tests.laws import law
 from tests.operators import dottest
@@ -216,8 +216,8 @@ def test_spreading_is_the_adjoint_of_registration(scanner, angle, seed, size, be
         field = Sensitivities(
             values=image[..., None].astype(np.float32), first=np.zeros(window[0], dtype=np.int64), motions=1
         )
-        spread = dense(_spread(field, places, whole), 1)[..., 0]
-        return np.stack([share.get(view, 0.0) * spread for view in (0, 1)])
+        moved = dense(spread(field, places, whole), 1)[..., 0]
+        return np.stack([share.get(view, 0.0) * moved for view in (0, 1)])
 
     dottest(forward, adjoint, (2, *whole), window, seed=seed)
 
@@ -232,13 +232,13 @@ def test_fields_whose_rows_meet_different_sections_are_spread_section_by_section
     field = Sensitivities(
         values=rng.normal(size=(*window, 4)).astype(np.float32), first=rng.integers(0, 4, window[0]), motions=2
     )
-    spread = _spread(field, places, whole)
-    assert (spread.first >= 0).all()
+    together = spread(field, places, whole)
+    assert (together.first >= 0).all()
     parts = dense(field, 10)
     for k in range(10):
         one = replace(field, values=parts[..., k : k + 1].astype(np.float32), first=0 * field.first, motions=1)
-        expected = dense(_spread(one, places, whole), 1)[..., 0]
-        np.testing.assert_allclose(dense(spread, 10)[..., k], expected, atol=1e-5)
+        expected = dense(spread(one, places, whole), 1)[..., 0]
+        np.testing.assert_allclose(dense(together, 10)[..., k], expected, atol=1e-5)
 
 
 # Filters

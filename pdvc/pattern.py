@@ -1,0 +1,81 @@
+"""The detector's fixed pattern: what the noise of the flats leaves in all radiographs alike, found in all of them.
+
+The mean of a few flats has a noise phi relative to the open beam, and s phi, s = dg / dq, is in the grey levels of
+every radiograph and every reference view. The sample moves, the pattern does not: with R_t what moves a reference view
+with the sample (`pdvc.systematic`), a step's residual holds
+
+    rho(t) = ... - s phi + R_t [s phi]                  -> rho(t) + psi - R_t psi    with psi taken from all images
+
+The mean over the steps tells psi, as R_t takes it to another place at each step, and each ray's own noise is averaged
+out. Against the prior that the flats tell, of variance v_psi, and with v the noise of a residual, of T steps,
+
+    psi <- psi - v_psi / (v_psi + v / T)  mean_t [rho(t) + psi - R_t psi]
+
+What is so slow over the detector that R_t hardly changes it is not found, and hardly in the residual.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.equations import Images
+from pdvc.noise import Noise
+from pdvc.radiographs import noise_overlap
+from pdvc.sections import SectionBasis
+from pdvc.systematic import Systematic
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+ROUNDS = 2
+"""Times that psi is improved: a third one changed nothing."""
+MOST = 4.0
+"""Standard deviations of the flats' noise that psi is held within: more is a misfit, not the flats' noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pattern:
+    """What all images of a detector have in common."""
+
+    grey: Image
+    """psi (row, column), grey levels, over the whole detector; zero outside the window."""
+    left: Image
+    """Share of the flats' variance that is left once psi is taken away (row, column); one outside the window."""
+
+
+def fixed_pattern(
+    images: Images, systematic: Systematic, basis: SectionBasis, amplitude: Floats, noise: Noise, residual: Image
+) -> Pattern:
+    """Return the pattern that a residual (step, row, column) shows, at amplitudes (step, section, motion), voxels."""
+    steps, window = len(residual), systematic.window
+    kept = noise_overlap(noise.smooth_px)[0] ** 2
+    own, slope = np.zeros(systematic.shape), np.zeros(systematic.shape)
+    for t in range(steps):
+        image = noise.step(t)
+        # a reference view has at most as much
+        own += 2 * kept * image.variance / steps
+        slope += image.slope / steps
+    prior = kept * slope**2 * noise.flat[window]
+    share = prior / (prior + own / steps)
+    most = MOST * np.sqrt(prior)
+    grey = np.zeros(systematic.detector, dtype=np.float32)
+    mean = residual.mean(axis=0, dtype=float)
+    for _ in range(ROUNDS):
+        moved = _mean_moved(images, systematic, basis, amplitude, grey)
+        grey[window] = np.clip(grey[window] - share * (mean + grey[window] - moved), -most, most)
+    left = np.ones(systematic.detector, dtype=np.float32)
+    left[window] = 1 - share
+    return Pattern(grey=grey, left=left)
+
+
+def _mean_moved(images: Images, systematic: Systematic, basis: SectionBasis, amplitude: Floats, grey: Image) -> Floats:
+    """Return the mean over the steps of R_t psi (row, column) over the window."""
+    alike = replace(systematic, left=lambda _: grey)
+    total = np.zeros(systematic.shape)
+    for t in range(len(amplitude)):
+        one = slice(t, t + 1)
+        total += alike.registered(one, images.rays[one], basis, amplitude[one], images.voxel_mm)[0]
+    return total / len(amplitude)
