@@ -39,7 +39,7 @@ from pdvc.verdict import Stop, listed
 Floats = NDArray[np.float64]
 
 RIDGE = 1e-6
-"""Share of the typical variance that is added to V: rounding leaves directions without any."""
+"""Share of each variance that is added to V: rounding leaves directions without any."""
 WORSE = 1e-3
 """A step that raises chi2 by more than this share is shortened: amplitudes under a prior may fit a little less."""
 SLOW_DEGREE = 4
@@ -180,14 +180,12 @@ def seen(equations: Equations, noise: Floats, amplitude: Floats) -> tuple[Seen, 
     `noise` is V (step, unknown, unknown). An unknown that no radiograph sees has no data.
     """
     matrix, vector = equations.matrix, equations.vector
-    diagonal = np.einsum("tnn->tn", matrix)
-    scale = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
+    variance = np.einsum("tnn->tn", noise)
+    scale = np.where(variance > 0, 1 / np.sqrt(np.maximum(variance, 1e-300)), 0.0)
     scaled = noise * scale[:, :, None] * scale[:, None]
-    variance = np.einsum("tnn->tn", scaled)
-    typical = np.array([np.median(row[row > 0]) if (row > 0).any() else 1.0 for row in variance])
     unknown = np.arange(matrix.shape[1])
     # what is not seen has unit noise, and no data
-    scaled[:, unknown, unknown] += np.where(variance > 0, RIDGE * typical[:, None], 1.0)
+    scaled[:, unknown, unknown] += np.where(variance > 0, RIDGE, 1.0)
     white = np.linalg.inv(np.linalg.cholesky(scaled)) * scale[:, None]
     right = vector + np.einsum("tnm,tm->tn", matrix, amplitude)
     return Seen(design=white @ matrix, data=np.einsum("tnm,tm->tn", white, right)), white
@@ -210,8 +208,9 @@ def _fitted(
 
 
 def _of_all(noise: Propagated) -> Floats:
-    """Return V of each step, of all sources."""
-    return np.asarray(sum(noise.own.values()))
+    """Return V of each step, of all sources: what e may be wrong by is weighed as if drawn anew at each step."""
+    each = noise.systematic
+    return np.asarray(sum(noise.own.values()) + each[:, :, None] * each[:, None])
 
 
 def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
@@ -232,10 +231,12 @@ def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
     for name, covariance in noise.own.items():
         draws = rng.standard_normal((*covariance.shape[:2], DRAWS))
         parts[name] = effect(fit.white @ (_root(covariance) @ draws), np.full(DRAWS, 1 / DRAWS))
-    parts["process"] = own - np.sum(list(parts.values()), axis=0)
     errors = np.einsum("tnm,tm->tn", fit.white, noise.systematic)[..., None]
+    anew = effect(errors * rng.standard_normal((steps, 1, DRAWS)), np.full(DRAWS, 1 / DRAWS))
+    parts["process"] = own - np.sum(list(parts.values()), axis=0) - anew
+    # e is wrong alike at all steps
     parts["systematic"] = effect(errors, np.ones(1))
-    own = own + parts["systematic"]
+    own = own - anew + parts["systematic"]
     metric = joined(matrix, slow)
     for name, each in noise.own.items():
         together = noise.parts[name]
