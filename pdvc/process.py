@@ -24,10 +24,12 @@ Where sections contract as much as they are stretched, the contraction is a part
 
 (nu = 1/2: no volume change), and its own modes are what this leaves: how much that is, the data tell.
 
-What radiographs tell of a step is c = B (a - a_0) + noise of covariance k(t) V(t), with k drawn as s is: a step whose
-radiograph the model of the image does not fit (a face along the beam) counts the less.
+What radiographs tell of a step is c = B (a + eta - a_0) + noise of covariance k(t) V(t), with k drawn as s is, and
+with eta = Phi N(0, n^2 m(t)) an apparent motion (`pdvc.apparent`): what the model of the image misses at that step, a
+face along the beam, counts the less, and only the motions that it looks like. m(t) is drawn as s is, by itself for
+each motion.
 
-Deviations q, e and roughnesses r are those of the largest marginal likelihood, with a broad prior of their own. Its
+Deviations q, e, n and roughnesses r are those of the largest marginal likelihood, with a broad prior of their own. Its
 gradient comes from the posterior (Fisher's identity):
 
     d log p / d log q^2 = 1/2 sum_t (E[w^2] / var w - 1)
@@ -42,6 +44,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.optimize import minimize
 
+from pdvc.apparent import Reduced, reduced
 from pdvc.banded import Blocks, Factor, factored
 from pdvc.sections import CONTRACTION, RIGID, TRANSLATION_Z, SectionBasis
 
@@ -63,15 +66,12 @@ TYPICAL_VOXEL = 0.01
 """Median of the broad prior of deviations q, voxels."""
 SPREAD = 2.5
 """Standard deviation of the broad priors' logarithms."""
-FAR = 3.5
-"""Standard deviations beyond most steps' misfit from which on a radiograph counts as not understood. What the model of
-the image misses, an edge along the beam, concerns few motions, and those far more than the misfit of all tells."""
-ASIDE = 10.0
-"""Times by which the noise of such a radiograph is then taken larger."""
+TYPICAL_APPARENT_VOXEL = 0.003
+"""Median of the broad prior of deviations n, voxels."""
 LEAST_VARIANCE = 1e-12
 """voxel^2, of any bend and any end: less would be lost in rounding, and moves nothing in a thousand steps."""
-_RANGE = np.log([1e-5, 10.0]), np.log([1e-4, 30.0]), np.array([0.2, 3.0])
-"""Limits of log q, log e, and r."""
+_RANGE = np.log([1e-5, 10.0]), np.log([1e-4, 30.0]), np.log([1e-5, 1.0]), np.array([0.2, 3.0])
+"""Limits of log q, log e, log n, and r."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +105,10 @@ class Deviations:
     """s of all others (step - 2,)."""
     misfit: Floats
     """k (step,)."""
+    apparent_voxel: Floats
+    """n (group,)."""
+    apparent_scale: Floats
+    """m (step, group)."""
 
 
 class StateSpace:
@@ -169,13 +173,19 @@ class StateSpace:
             rigid_scale=np.ones((max(steps - 2, 0), self.rigid)),
             own_scale=np.ones(max(steps - 2, 0)),
             misfit=np.ones(steps),
+            apparent_voxel=np.full(self.rigid + motions, TYPICAL_APPARENT_VOXEL),
+            apparent_scale=np.ones((steps, self.rigid + motions)),
         )
 
     def fixed(self, bend_voxel: float) -> Deviations:
-        """Return the same deviation for all bends, and ends as wide as the prior."""
+        """Return the same deviation for all bends, ends as wide as the prior, and no apparent motion."""
         guess = self.first_guess()
-        ends = np.full_like(guess.end_voxel, self.prior_voxel)
-        return replace(guess, bend_voxel=np.full_like(guess.bend_voxel, bend_voxel), end_voxel=ends)
+        return replace(
+            guess,
+            bend_voxel=np.full_like(guess.bend_voxel, bend_voxel),
+            end_voxel=np.full_like(guess.end_voxel, self.prior_voxel),
+            apparent_voxel=np.zeros_like(guess.apparent_voxel),
+        )
 
     def relative(self, deviations: Deviations) -> Floats:
         """Return the variance of each state over that of its group's first mode (state,)."""
@@ -193,6 +203,10 @@ class StateSpace:
         """Return the prior variance of the first and the last state (state,), voxel^2."""
         deviation = np.concatenate([np.full(self.rigid, self.prior_voxel), deviations.end_voxel])[self.group]
         return np.asarray(deviation**2 * self.relative(deviations) + LEAST_VARIANCE)
+
+    def apparent_variance(self, deviations: Deviations) -> Floats:
+        """Return the variance of eta (step, state), voxel^2."""
+        return np.asarray((deviations.apparent_voxel**2 * deviations.apparent_scale)[:, self.group])
 
     def precision(self, deviations: Deviations, information: Floats) -> Blocks:
         """Return the posterior precision of all states, with what the data tell of each (step, state, state)."""
@@ -241,6 +255,8 @@ class Smoothed:
     """Of the posterior precision without the trend."""
     held: Floats
     """A^-1 times the information of the trend (step, state, p)."""
+    reduced: Reduced
+    """What the data tell of the states."""
     trend_covariance: Floats
     log_likelihood: float
     """Marginal likelihood, up to a constant."""
@@ -256,13 +272,17 @@ class Process:
         information = self._design.transpose(0, 2, 1) @ self._design
         self._information = (information + information.transpose(0, 2, 1)) / 2
         self._vector = np.einsum("tnm,tn->tm", self._design, seen.data)
-        self._of_trend = self._information @ space.trend
 
     def smoothed(self, deviations: Deviations) -> Smoothed:
         """Return the states under given deviations."""
         space, weight = self.space, 1 / deviations.misfit
-        vector, of_trend = self._vector * weight[:, None], self._of_trend * weight[:, None, None]
-        factor = factored(space.precision(deviations, self._information * weight[:, None, None]))
+        told = reduced(
+            self._information * weight[:, None, None],
+            self._vector * weight[:, None],
+            space.apparent_variance(deviations),
+        )
+        vector, of_trend = told.vector, told.information @ space.trend
+        factor = factored(space.precision(deviations, told.information))
         found = factor.solved(np.concatenate([vector[..., None], of_trend], axis=2))
         held, wide = found[..., 1:], np.eye(of_trend.shape[2]) / space.prior_voxel**2
         matrix = wide + np.einsum("tmp,tmq->pq", space.trend, of_trend) - np.einsum("tmp,tmq->pq", of_trend, held)
@@ -273,44 +293,47 @@ class Process:
         misfit = float(
             (self.seen.data**2 * weight[:, None]).sum() + self.seen.unknowns * np.log(deviations.misfit).sum()
         )
+        misfit += told.log_determinant - told.squares
         log = squares - misfit - factor.log_determinant - np.linalg.slogdet(matrix)[1] + space.log_prior(deviations)
         return Smoothed(
             states=states,
             trend=p,
             factor=factor,
             held=held,
+            reduced=told,
             trend_covariance=np.linalg.inv(matrix),
             log_likelihood=float(log / 2),
         )
 
     def amplitude(self, smoothed: Smoothed) -> Floats:
         """Return the mean amplitudes (step, unknown), voxels."""
-        return np.asarray((smoothed.states + self.space.trend @ smoothed.trend) @ self.space.to_amplitude.T)
+        return np.asarray(self._total(smoothed) @ self.space.to_amplitude.T)
 
     def covariance(self, smoothed: Smoothed, inverse: Blocks) -> Floats:
         """Return the posterior covariance of each step's amplitudes (step, unknown, unknown), voxel^2."""
         to = self.space.to_amplitude
-        trend = to @ (self.space.trend - smoothed.held)
-        return np.asarray(to @ inverse.own @ to.T + trend @ smoothed.trend_covariance @ trend.transpose(0, 2, 1))
+        return np.asarray(to @ self._of_states(smoothed, inverse) @ to.T)
+
+    def _of_states(self, smoothed: Smoothed, inverse: Blocks) -> Floats:
+        """Return the posterior covariance of each step's states, trend included (step, state, state), voxel^2."""
+        trend = self.space.trend - smoothed.held
+        return np.asarray(inverse.own + trend @ smoothed.trend_covariance @ trend.transpose(0, 2, 1))
 
     def response(self, smoothed: Smoothed, deviations: Deviations, noise: Floats) -> Floats:
         """Return what errors of the data y (step, unknown, draw) do to the amplitudes (the same), voxels."""
         space = self.space
-        vector = self._design.transpose(0, 2, 1) / deviations.misfit[:, None, None] @ noise
+        vector = smoothed.reduced.of(self._design.transpose(0, 2, 1) / deviations.misfit[:, None, None] @ noise)
         found = smoothed.factor.solved(vector)
         of_data = np.einsum("tmp,tmd->pd", space.trend - smoothed.held, vector)
         p = smoothed.trend_covariance @ of_data
         return np.asarray(space.to_amplitude @ (found + (space.trend - smoothed.held) @ p))
 
     def fitted(self, deviations: Deviations, rounds: int = ROUNDS) -> Deviations:
-        """Return deviations of the largest marginal likelihood: q, e and r, and the scales, in turn."""
-        for left in reversed(range(rounds)):
+        """Return deviations of the largest marginal likelihood: q, e, n and r, and the scales, in turn."""
+        for _ in range(rounds):
             deviations = self._likeliest(deviations)
             smoothed = self.smoothed(deviations)
             deviations = self._rescaled(deviations, smoothed, smoothed.factor.inverted())
-            # only once events have been found: until then they look like radiographs that do not fit
-            if left == 0:
-                deviations = replace(deviations, misfit=set_aside(deviations.misfit, self.seen.unknowns))
         return deviations
 
     def _squares(self, smoothed: Smoothed, inverse: Blocks) -> tuple[Floats, Floats]:
@@ -328,31 +351,38 @@ class Process:
         return bends, smoothed.states[ends] ** 2 + own + of_trend(smoothed.held[ends])
 
     def _likeliest(self, deviations: Deviations) -> Deviations:
-        """Return deviations whose q, e and r have the largest marginal likelihood, for given scales."""
+        """Return deviations whose q, e, n and r have the largest marginal likelihood, for given scales."""
         space = self.space
         groups, motions = len(deviations.bend_voxel), len(deviations.end_voxel)
-        typical = np.concatenate([np.full(groups, np.log(TYPICAL_VOXEL)), np.zeros(motions), np.ones(motions)])
-        spread = np.concatenate([np.full(groups + motions, SPREAD), np.full(motions, 0.5)])
+        counts = (groups, motions, groups, motions)
+        typical = np.repeat([np.log(TYPICAL_VOXEL), 0.0, np.log(TYPICAL_APPARENT_VOXEL), 1.0], counts)
+        spread = np.repeat([SPREAD, SPREAD, SPREAD, 0.5], counts)
 
         def unpacked(x: Floats) -> Deviations:
-            q, e, r = np.exp(x[:groups]), np.exp(x[groups : groups + motions]), x[groups + motions :]
-            return replace(deviations, bend_voxel=q, end_voxel=e, roughness=r)
+            q, e, n, r = np.split(x, np.cumsum(counts)[:-1])
+            return replace(
+                deviations, bend_voxel=np.exp(q), end_voxel=np.exp(e), apparent_voxel=np.exp(n), roughness=r
+            )
 
         def minus_log(x: Floats) -> tuple[float, Floats]:
             trial = unpacked(x)
             smoothed = self.smoothed(trial)
-            bends, ends = self._squares(smoothed, smoothed.factor.inverted())
+            inverse = smoothed.factor.inverted()
+            bends, ends = self._squares(smoothed, inverse)
             of_bends = _slope(bends, space.bend_variance(trial)).sum(axis=0)
             of_ends = _slope(ends, space.end_variance(trial)).sum(axis=0)
             q = np.bincount(space.group, of_bends, minlength=groups)
             e = np.bincount(space.group, of_ends, minlength=groups)[space.rigid :]
             own = (of_bends + of_ends)[space.rigid :].reshape(motions, -1)
+            of_apparent = self._apparent(smoothed, inverse) / space.apparent_variance(trial) - 1
+            n = np.bincount(space.group, of_apparent.sum(axis=0), minlength=groups)
             away = (x - typical) / spread
-            gradient = np.concatenate([q, e, own @ space.log_value / 2]) - away / spread
+            gradient = np.concatenate([q, e, n, own @ space.log_value / 2]) - away / spread
             return -smoothed.log_likelihood + float(away @ away) / 2, -gradient
 
-        start = np.concatenate([np.log(deviations.bend_voxel), np.log(deviations.end_voxel), deviations.roughness])
-        limits = np.repeat(np.stack(_RANGE), [groups, motions, motions], axis=0)
+        logs = [np.log(each) for each in (deviations.bend_voxel, deviations.end_voxel, deviations.apparent_voxel)]
+        start = np.concatenate([*logs, deviations.roughness])
+        limits = np.repeat(np.stack(_RANGE), counts, axis=0)
         options = {"maxiter": EVALUATIONS, "maxfun": EVALUATIONS}
         found = minimize(minus_log, start, jac=True, method="L-BFGS-B", bounds=limits, options=options)
         return unpacked(found.x)
@@ -364,26 +394,33 @@ class Process:
         flat = replace(deviations, rigid_scale=np.ones((len(bends), space.rigid)), own_scale=np.ones(len(bends)))
         share = bends / space.bend_variance(flat)
         rigid = space.group < space.rigid
-        covariance = self.covariance(smoothed, inverse)
-        left = self.seen.data - np.einsum("tnm,tm->tn", self.seen.design, self.amplitude(smoothed))
-        spread = np.einsum("tnm,tmk,tnk->t", self.seen.design, covariance, self.seen.design, optimize=True)
+        apparent = self._apparent(smoothed, inverse)
+        mean, covariance = smoothed.reduced.seen(self._total(smoothed), self._of_states(smoothed, inverse))
+        left = self.seen.data - np.einsum("tnm,tm->tn", self._design, mean)
+        spread = np.einsum("tmk,tmk->t", self._information, covariance)
+        groups = np.arange(len(deviations.apparent_voxel))
+        of_groups = np.maximum(deviations.apparent_voxel, 1e-300) ** 2
+        share_of = [(apparent[:, space.group == g] / of_groups[g])[:, None] for g in groups]
         return replace(
             deviations,
             rigid_scale=_expected(share[:, rigid, None], RIGID_FREEDOM),
             own_scale=_expected(share[:, ~rigid], FREEDOM),
             misfit=(FREEDOM + (left**2).sum(axis=1) + spread) / (FREEDOM + self.seen.unknowns),
+            apparent_scale=np.concatenate([_expected(each, RIGID_FREEDOM) for each in share_of], axis=1),
         )
+
+    def _total(self, smoothed: Smoothed) -> Floats:
+        """Return the mean states with the trend (step, state)."""
+        return np.asarray(smoothed.states + self.space.trend @ smoothed.trend)
+
+    def _apparent(self, smoothed: Smoothed, inverse: Blocks) -> Floats:
+        """Return E[eta^2] (step, state)."""
+        return smoothed.reduced.apparent(self._total(smoothed), self._of_states(smoothed, inverse))
 
 
 def _slope(squares: Floats, variance: Floats) -> Floats:
     """Return d log p / d log of a deviation, of each variance that follows its square, but for the least one."""
     return np.asarray((squares / variance - 1) * (1 - LEAST_VARIANCE / variance))
-
-
-def set_aside(misfit: Floats, count: int) -> Floats:
-    """Return misfits (step,), each of a `count` of data, those far beyond the others made `ASIDE` times as large."""
-    limit = (1 + FAR * np.sqrt(2 / count)) * np.median(misfit)
-    return np.asarray(np.where(misfit > limit, ASIDE * misfit, misfit))
 
 
 def _expected(share: Floats, freedom: float) -> Floats:

@@ -32,7 +32,7 @@ from threadpoolctl import threadpool_limits
 from pdvc.equations import Equations, joined
 from pdvc.history import Angle, Polynomial, TimeFunction, time_basis
 from pdvc.noise import Propagated
-from pdvc.process import ASIDE, FITTED_MODES, ROUNDS, Deviations, Process, Seen, Smoothed, StateSpace
+from pdvc.process import FITTED_MODES, ROUNDS, Deviations, Process, Seen, Smoothed, StateSpace
 from pdvc.solution import SHORTER, Known, Problem, Solution, Solver
 from pdvc.verdict import Stop, listed
 
@@ -50,6 +50,8 @@ RANK = 300
 """Directions of noise common to steps that are followed, the largest."""
 WEAK = 1e-6
 """Ridge of the metric, over its diagonal."""
+STRANGE = 100.0
+"""Scale of apparent motion from which on a radiograph is told: ten times the typical deviation."""
 EVENT = 25.0
 """Scale of bends from which on a step is told as an event: five times the typical bend."""
 
@@ -276,7 +278,7 @@ def _in_words(deviations: Deviations) -> str:
     events = np.flatnonzero(np.maximum(deviations.rigid_scale.max(axis=1), deviations.own_scale) > EVENT) + 1
     if len(events):
         said += f", far larger at step {listed(events.tolist())}"
-    misfits = np.flatnonzero(deviations.misfit > ASIDE)
-    if len(misfits):
-        said += f"; radiographs set aside, as they do not fit as their noise tells: step {listed(misfits.tolist())}"
+    strange = np.flatnonzero(deviations.apparent_scale.max(axis=1) > STRANGE) + 1
+    if len(strange):
+        said += f"; radiographs that tell another motion than their neighbours: step {listed(strange.tolist())}"
     return said
