@@ -59,7 +59,7 @@ class Reduced:
 
 
 def reduced(information: Floats, vector: Floats, variance: Floats) -> Reduced:
-    """Return what J (step, state, state) and v (step, state) tell, for apparent motions of a variance (step, state)."""
+    """Return what J (step, state, state) and v (step, state) tell, eta of a variance (step, state) eliminated."""
     deviation = np.sqrt(variance)
     scaled = information * deviation[:, :, None] * deviation[:, None]
     diagonal = np.arange(scaled.shape[1])

@@ -10,7 +10,7 @@ import psutil
 from numpy.typing import NDArray
 
 from pdvc.progress import Progress, silent
-from pdvc.projection import normal_equations, project
+from pdvc.projection import BlockVectors, normal_equations, project
 from pdvc.sections import SectionBasis
 from pdvc.systematic import Systematic
 from pdvc.volume import Volume
@@ -61,6 +61,8 @@ class Equations:
     """rho (step, row, column), grey levels; of volumes (step, z, y, x), grey levels per mm."""
     pixels: int
     """Number of used pixels, or voxels, over all steps."""
+    blocks: tuple[BlockVectors, ...] = ()
+    """c of each step, block by block; of volumes none."""
 
     @property
     def rms(self) -> float:
@@ -99,6 +101,7 @@ def linearise(
     steps, size = len(images.grey), basis.shape[0] * basis.shape[1]
     matrix, vector, chi2 = np.empty((steps, size, size)), np.empty((steps, size)), np.empty(steps)
     residual = np.empty_like(images.grey)
+    blocks: list[BlockVectors] = []
     for part in _parts(steps):
         result = normal_equations(
             images.volume,
@@ -111,8 +114,16 @@ def linearise(
         )
         matrix[part], vector[part], chi2[part] = result.matrix, result.vector, result.chi2
         residual[part] = result.residual
+        blocks += result.blocks
         progress(task, part.stop, steps)
-    return Equations(matrix=matrix, vector=vector, chi2=chi2, residual=residual, pixels=images.used_pixels)
+    return Equations(
+        matrix=matrix,
+        vector=vector,
+        chi2=chi2,
+        residual=residual,
+        pixels=images.used_pixels,
+        blocks=tuple(blocks),
+    )
 
 
 def joined(blocks: Floats, time_functions: Floats, others: Floats | None = None) -> Floats:

@@ -80,7 +80,7 @@ class MeasureOptions(Settings):
     """rows left out at the top and at the bottom, px; default: 100 of 954, or more where rays need it"""
     discard_columns: Annotated[int, Field(ge=0)] | None = None
     """columns left out on the left and on the right, px; default: 60 of 432, or less for a wide sample"""
-    sections: Annotated[int, Field(ge=2)] = 21
+    sections: Annotated[int, Field(ge=2)] = 29
     """sections, equally spaced over the used height"""
     section_motions: tuple[str, ...] = names_of((*RIGID, CONTRACTION))
     """motions of a section: six rigid ones, and contraction"""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pdvc.sections import SectionBasis
 from pdvc.volume import Hull, Volume
-from pdvc.walk import BAND_ROWS, Scene, Steps, Sums, walk_bands
+from pdvc.walk import BAND_ROWS, BLOCK_COLUMNS, Scene, Steps, Sums, walk_bands
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -32,6 +32,16 @@ Image = NDArray[np.float32]
 _NOWHERE = np.float32(-1e6)
 _FARTHEST = 2.0
 """Distances from the axis to the source within which a moved sample is followed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockVectors:
+    """c of a step, of each block of `BAND_ROWS` x `BLOCK_COLUMNS` pixels by itself."""
+
+    values: Floats
+    """(band of rows, block, unknown): unknowns count from the band's first; those beyond the last are zero."""
+    first: NDArray[np.int64]
+    """(band,) the first unknown of a band."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +56,8 @@ class StepEquations:
     """Weighted sum of squared residuals (step,), grey level^2."""
     residual: Image
     """rho (step, row, column), grey levels, in every pixel of the window, whatever its weight."""
+    blocks: list[BlockVectors]
+    """c of each step, block by block."""
 
 
 def normal_equations(
@@ -161,7 +173,7 @@ def _walk(
     size = max(span for _, span in bands) * motions if with_sensitivities else 0
     sums = Sums(
         matrices=np.zeros((*low.shape, size, size)),
-        vectors=np.zeros((*low.shape, size)),
+        vectors=np.zeros((*low.shape, -(-target.shape[2] // BLOCK_COLUMNS), size)),
         chi2=np.zeros(low.shape),
         residual=np.empty(target.shape, dtype=np.float32),
         kept=np.zeros((*target.shape, size) if fields is not None else (steps, 0, 0, 0), dtype=np.float32),
@@ -194,15 +206,21 @@ def _scene(volume: Volume, basis: SectionBasis, voxel_mm: float) -> Scene:
 
 def _joined(sums: Sums, first: NDArray[np.int64], unknowns: int) -> StepEquations:
     """Add the bands of each step, in order; `first` (step, band) are their first unknowns. No unknowns: no B, no c."""
-    steps, size = len(first), sums.vectors.shape[2]
+    steps, size = len(first), sums.vectors.shape[3]
     matrix, vector = np.zeros((steps, unknowns, unknowns)), np.zeros((steps, unknowns))
     for t, band in np.ndindex(first.shape if unknowns else (0, 0)):
         count = min(size, unknowns - int(first[t, band]))
         here = slice(int(first[t, band]), int(first[t, band]) + count)
         matrix[t, here, here] += sums.matrices[t, band, :count, :count]
-        vector[t, here] += sums.vectors[t, band, :count]
+        vector[t, here] += sums.vectors[t, band, :, :count].sum(axis=0)
     matrix += np.tril(matrix, -1).transpose(0, 2, 1)
-    return StepEquations(matrix=matrix, vector=vector, chi2=sums.chi2.sum(axis=1), residual=sums.residual)
+    return StepEquations(
+        matrix=matrix,
+        vector=vector,
+        chi2=sums.chi2.sum(axis=1),
+        residual=sums.residual,
+        blocks=[BlockVectors(values=sums.vectors[t], first=first[t]) for t in range(steps)],
+    )
 
 
 def _indexed(affine: Floats, origin_mm: Floats, voxel_mm: float) -> Floats:

@@ -29,10 +29,12 @@ from pydantic import Field
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
+from pdvc.coherent import by_block, excess
 from pdvc.equations import Equations, joined
 from pdvc.history import Angle, Polynomial, TimeFunction, time_basis
 from pdvc.noise import Propagated
 from pdvc.process import FITTED_MODES, ROUNDS, Deviations, Process, Seen, Smoothed, StateSpace
+from pdvc.projection import BlockVectors
 from pdvc.solution import SHORTER, Known, Problem, Solution, Solver
 from pdvc.verdict import Stop, listed
 
@@ -123,7 +125,7 @@ class Smoother(Solver):
                 break
         with _one_thread():
             fit = _fitted(spaces, equations, noise, amplitude, deviations, 0)
-            known = _known(fit, noise, slow, equations.matrix)
+            known = _known(fit, noise, slow, equations, problem.basis.shape)
         return Solution(
             coefficients=amplitude.reshape(steps, *shape) / np.sqrt(steps),
             equations=equations,
@@ -215,12 +217,12 @@ def _of_all(noise: Propagated) -> Floats:
     return np.asarray(sum(noise.own.values()) + each[:, :, None] * each[:, None])
 
 
-def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
+def _known(fit: _Fit, noise: Propagated, slow: Floats, equations: Equations, shape: tuple[int, int]) -> Known:
     """Return the covariance of the amplitudes over the square root of the steps, and what makes it.
 
-    `matrix` is B (step, unknown, unknown).
+    `shape` of the unknowns is (section, motion).
     """
-    process, steps = fit.process, len(matrix)
+    process, matrix, steps = fit.process, equations.matrix, len(equations.matrix)
     own = process.covariance(fit.smoothed, fit.smoothed.factor.inverted())
 
     def effect(errors: Floats, weight: Floats) -> Floats:
@@ -249,7 +251,31 @@ def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
             left = effect(process.seen.design @ moved, weight)
             parts[name] = parts[name] + left
             own = own + left
+    if equations.blocks and steps > SLOW_DEGREE:
+        parts["image model"] = _of_image_model(fit, slow, equations.blocks, shape)
+        own = own + parts["image model"]
     return Known(covariance=own / steps, by_source={name: part / steps for name, part in parts.items()})
+
+
+def _of_image_model(fit: _Fit, slow: Floats, blocks: tuple[BlockVectors, ...], shape: tuple[int, int]) -> Floats:
+    """Return the covariance (step, unknown, unknown) of slow errors beyond noise: `pdvc.coherent`."""
+    process, design = fit.process, fit.process.seen.design
+    turned = design.transpose(0, 2, 1)
+    metric = joined(turned @ design, slow)
+    metric[np.diag_indices_from(metric)] += WEAK * np.diag(metric)
+
+    def effect(z: Floats) -> Floats:
+        """Return what z (function, unknown, draw) does to the amplitudes (step, unknown, draw)."""
+        found = linalg.solve(metric, z.reshape(len(metric), -1), assume_a="pos").reshape(z.shape)
+        return process.response(fit.smoothed, fit.deviations, design @ np.einsum("ft,fnd->tnd", slow, found))
+
+    draws = np.random.default_rng(0).standard_normal((*design.shape[:2], DRAWS))
+    noise = effect(np.einsum("ft,tnd->fnd", slow, turned @ draws))
+    covariance = noise @ noise.transpose(0, 2, 1) / DRAWS
+    seen = effect(by_block(blocks, turned @ fit.white, slow))
+    more = excess(seen, np.einsum("tnn->tn", covariance), shape)
+    factor = np.sqrt(np.tile(more, shape[0]))
+    return np.asarray(covariance * (np.outer(factor, factor) - 1))
 
 
 def _root(covariance: Floats) -> Floats:

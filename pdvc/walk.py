@@ -38,6 +38,8 @@ Image = NDArray[np.float32]
 
 BAND_ROWS = 16
 """Rows of pixels that one task works on; part of the result's definition, as sums are ordered by it."""
+BLOCK_COLUMNS = 16
+"""Columns of a block, for which c is summed by itself."""
 
 _f = np.float32
 _BIG = 1e30
@@ -88,7 +90,7 @@ class Sums(NamedTuple):
     matrices: Floats
     """B of each band, lower triangle (step, band, unknown, unknown); unknowns count from the band's lowest section."""
     vectors: Floats
-    """c of each band (step, band, unknown)."""
+    """c of each block of a band (step, band, block, unknown)."""
     chi2: Floats
     """(step, band)"""
     residual: Image
@@ -114,7 +116,7 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
     phase = _f(phase64)
     box, rays, maps, target = steps.box[t], steps.rays[t], steps.maps[t], steps.target[t]
     weight, low = steps.weight[t % len(steps.weight)], steps.low[t, band]
-    matrix, vector, chi2 = sums.matrices[t, band], sums.vectors[t, band], sums.chi2[t]
+    matrix, vectors, chi2 = sums.matrices[t, band], sums.vectors[t, band], sums.chi2[t]
     residual, kept = sums.residual[t], sums.kept[t]
     rows, columns = target.shape
     n, motions = patterns.shape[0], patterns.shape[1]
@@ -126,7 +128,7 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
     to_y, most_y = (row_of, np.uint32(1), layer), (_f(nx - 1.0001), _f(shape[0] - 1.0001))
     # scratch, made once for all rays; s holds the sensitivities of one pixel
     normals, limit16 = _NORMALS32, np.empty(_NORMALS32.shape[1], np.float32)
-    s = np.zeros(max(vector.shape[0], 1))
+    s = np.zeros(max(vectors.shape[1], 1))
     base, along, k12 = np.empty(3), np.empty(3), np.empty(12)
     middle = 0.5 * (box[0] + box[1])
     # rows outside, columns inside: neighbours of a row walk through the same two layers of voxels, still in the cache
@@ -205,7 +207,7 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
                 # only the sections that this ray met: S of a pixel is zero elsewhere, and so are its products
                 first, last = (k_first - low) * motions, (k_last + 1 - low) * motions
                 if w > 0:
-                    _add_outer(matrix, vector, s, first, last, w, rho)
+                    _add_outer(matrix, vectors[column // BLOCK_COLUMNS], s, first, last, w, rho)
                 if kept.size > 0:
                     for i in range(first, last):
                         kept[row, column, i] = s[i]
