@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from pdvc.experiment import Experiment
-from pdvc.gauss_newton import GaussNewton  # noqa: F401 - a kind of solver that options may name
+from pdvc.gauss_newton import GaussNewton
 from pdvc.geometry import ConeBeam
 from pdvc.history import PAPER, Ramp, TimeFunction, settled
 from pdvc.pgd import Pgd
@@ -29,6 +29,10 @@ def motions_of(names: tuple[str, ...]) -> tuple[SectionPattern, ...]:
 
 COARSE_ROWS = 100
 """Rows that the coarse scale leaves at least."""
+
+MOST_SECTIONS = 29
+USUAL_ROWS = 11
+"""Rows of the detector for each section, at least, unless a number of sections is asked for."""
 
 Scale = Annotated[int, Field(ge=1, le=16)]
 
@@ -60,11 +64,11 @@ def coarse_scale(geometry: ConeBeam) -> int:
 
 
 COARSE_TO_FINE_RIGID = (
-    StageOptions(scale="coarse", solver=Pgd(most_modes=3, passes_per_mode=6)),
-    StageOptions(scale=2, solver=Pgd(most_modes=5, passes_per_mode=3)),
+    StageOptions(scale="coarse", solver=GaussNewton(most_passes=6)),
+    StageOptions(scale=2, solver=GaussNewton(most_passes=4)),
 )
 COARSE_TO_FINE = (
-    StageOptions(scale=2, solver=Pgd(most_modes=4, passes_per_mode=8)),
+    StageOptions(scale=2, solver=GaussNewton(most_passes=4)),
     StageOptions(scale=1, solver=Smoother()),
 )
 
@@ -80,8 +84,8 @@ class MeasureOptions(Settings):
     """rows left out at the top and at the bottom, px; default: 100 of 954, or more where rays need it"""
     discard_columns: Annotated[int, Field(ge=0)] | None = None
     """columns left out on the left and on the right, px; default: 60 of 432, or less for a wide sample"""
-    sections: Annotated[int, Field(ge=2)] = 29
-    """sections, equally spaced over the used height"""
+    sections: Annotated[int, Field(ge=2)] | None = None
+    """sections, equally spaced over the used height; default: 29, or fewer, so that each has 11 rows of the detector"""
     section_motions: tuple[str, ...] = names_of((*RIGID, CONTRACTION))
     """motions of a section: six rigid ones, and contraction"""
     time: tuple[TimeFunction, ...] = (*PAPER[:3], Ramp(powers=(0, 1, 2, 3)))
@@ -104,6 +108,12 @@ class MeasureOptions(Settings):
     """all pixels alike, as in the paper, or by the inverse of their noise"""
     prior_voxel: Annotated[float, Field(gt=0)] = 30.0
     """standard deviation of every amplitude before the data, voxels (rms over the steps)"""
+
+    def sections_for(self, rows: int) -> int:
+        """Return the number of sections for a detector of so many rows."""
+        if self.sections is not None:
+            return self.sections
+        return max(min(MOST_SECTIONS, rows // USUAL_ROWS), 2)
 
     @property
     def motions(self) -> tuple[SectionPattern, ...]:
@@ -146,6 +156,8 @@ class ResolvedOptions(MeasureOptions):
     """rows left out at the top and at the bottom, px"""
     discard_columns: Annotated[int, Field(ge=0)]
     """columns left out on the left and on the right, px"""
+    sections: Annotated[int, Field(ge=2)]
+    """sections, equally spaced over the used height"""
     rigid: tuple[ResolvedStage, ...]
     """the sample as one rigid body; one stage or several, from coarse to fine"""
     deformation: tuple[ResolvedStage, ...]
@@ -164,6 +176,7 @@ def resolved(
     found = {
         "discard_rows": discard_rows,
         "discard_columns": discard_columns,
+        "sections": options.sections_for(experiment.geometry.rows),
         "time": settled(options.time, experiment.test),
         "rigid": tuple(stage.at(experiment.geometry) for stage in options.rigid),
         "deformation": tuple(stage.at(experiment.geometry) for stage in options.deformation),

@@ -11,7 +11,10 @@ out. Against the prior that the flats tell, of variance v_psi, and with v the no
 
     psi <- psi - v_psi / (v_psi + v / T)  mean_t [rho(t) + psi - R_t psi]
 
-What is so slow over the detector that R_t hardly changes it is not found, and hardly in the residual.
+What is so slow over the detector that R_t hardly changes it is not found, and hardly in the residual. An error of the
+motion leaves a mean residual, too, alike in all directions along the beam: smooth over pixels, as edges and texture
+pass by, where the flats' noise is white. So only what is left above a Gaussian of some pixels is taken for it; the
+motion would else stay where it was when psi was found.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from pdvc.equations import Images
 from pdvc.noise import Noise
@@ -32,6 +36,8 @@ Image = NDArray[np.float32]
 
 ROUNDS = 2
 """Times that psi is improved: a third one changed nothing."""
+SMOOTH_PX = 3.0
+"""Standard deviation of the Gaussian whose mean around a pixel is no pattern."""
 MOST = 4.0
 """Standard deviations of the flats' noise that psi is held within: more is a misfit, not the flats' noise."""
 
@@ -59,16 +65,31 @@ def fixed_pattern(
         own += 2 * kept * image.variance / steps
         slope += image.slope / steps
     prior = kept * slope**2 * noise.flat[window]
-    share = prior / (prior + own / steps)
+    share = 1 - left_of_flats(prior, own, steps)
     most = MOST * np.sqrt(prior)
     grey = np.zeros(systematic.detector, dtype=np.float32)
     mean = residual.mean(axis=0, dtype=float)
     for _ in range(ROUNDS):
         moved = _mean_moved(images, systematic, basis, amplitude, grey)
-        grey[window] = np.clip(grey[window] - share * (mean + grey[window] - moved), -most, most)
+        grey[window] = np.clip(_fine(grey[window] - share * (mean + grey[window] - moved)), -most, most)
     left = np.ones(systematic.detector, dtype=np.float32)
-    left[window] = 1 - share
+    # of white noise, the Gaussian's mean keeps 1 / (4 pi sigma^2)
+    left[window] = 1 - share * (1 - 1 / (4 * np.pi * SMOOTH_PX**2))
     return Pattern(grey=grey, left=left)
+
+
+def _fine(image: Floats) -> Floats:
+    """Return what an image holds above its mean around each pixel."""
+    return np.asarray(image - ndimage.gaussian_filter(image, SMOOTH_PX, mode="nearest"))
+
+
+def left_of_flats(prior: Floats, own: Floats, steps: int) -> Floats:
+    """Return the share of the flats' variance that is left, v / T over v_psi + v / T.
+
+    From v_psi and the variance v of a residual of `steps` steps, both grey levels squared.
+    """
+    each = own / steps
+    return np.asarray(np.divide(each, prior + each, out=np.ones_like(each), where=prior + each > 0))
 
 
 def _mean_moved(images: Images, systematic: Systematic, basis: SectionBasis, amplitude: Floats, grey: Image) -> Floats:

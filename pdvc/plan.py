@@ -30,6 +30,7 @@ from pdvc.experiment import Experiment, Series
 from pdvc.history import time_basis
 from pdvc.noise import BELIEF
 from pdvc.options import MeasureOptions
+from pdvc.pattern import left_of_flats
 from pdvc.preparation import prepare, stated_noise
 from pdvc.progress import Progress, silent
 from pdvc.projection import Sensitivities, sensitivities
@@ -103,9 +104,10 @@ class Planner:
         self._images = prepared.images
         self._systematic = prepared.systematic
         left = noise_overlap(noise.smooth_px)[0] ** 2
-        self._variance = left * float(
-            np.mean([noise.step(t).variance.mean() for t in range(len(self._reference_rad))])
-        )
+        steps = [noise.step(t) for t in range(len(self._reference_rad))]
+        self._variance = left * float(np.mean([step.variance.mean() for step in steps]))
+        flat = noise.flat[prepared.systematic.window]
+        self._of_flats = left * float(np.mean([(step.slope**2 * flat).mean() for step in steps]))
         self._worked_out: dict[str, tuple[Floats, Floats, Floats, Floats]] = {}
 
     @property
@@ -130,6 +132,9 @@ class Planner:
         basis = self._setup.with_sections(self._setup.options.sections if test.sections is None else test.sections)
         functions = time_basis(tuple(part.stretched(test.share) for part in self._time), test.recorded())
         matrix, noise, flats, believed = self._sums(basis, functions, test)
+        if self._setup.options.remove_pattern:
+            of_flats, own = np.array(self._of_flats / test.flats), np.array(2 * self._variance)
+            flats = flats * left_of_flats(of_flats, own, len(test.angle_rad))
         noise = (noise + flats / test.flats) / test.frames + believed
         # the solvers count residuals, which the prior's ridge follows
         gamma2 = self._variance / test.frames

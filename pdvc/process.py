@@ -56,6 +56,8 @@ FREEDOM = 4.0
 """Degrees of freedom of Student's distribution of the bends of all modes together, and of the radiographs' misfit."""
 RIGID_FREEDOM = 1.0
 """The same of the bends of one rigid motion, which may slip by many times what it usually does: Cauchy's."""
+APPARENT_FREEDOM = 2.0
+"""The same of the apparent motions of one kind at a step: what is far larger than others is rather a slip."""
 LONGEST_GAP = 4.0
 """Gap between steps, in median gaps, beyond which the sample is held rather than moved."""
 ROUNDS = 4
@@ -401,12 +403,15 @@ class Process:
         groups = np.arange(len(deviations.apparent_voxel))
         of_groups = np.maximum(deviations.apparent_voxel, 1e-300) ** 2
         share_of = [(apparent[:, space.group == g] / of_groups[g])[:, None] for g in groups]
+        apparent_scale = np.concatenate([_expected(each, APPARENT_FREEDOM) for each in share_of], axis=1)
+        # with neighbours on one side only it could as well be a motion
+        apparent_scale[space.ends] = 1
         return replace(
             deviations,
             rigid_scale=_expected(share[:, rigid, None], RIGID_FREEDOM),
             own_scale=_expected(share[:, ~rigid], FREEDOM),
             misfit=(FREEDOM + (left**2).sum(axis=1) + spread) / (FREEDOM + self.seen.unknowns),
-            apparent_scale=np.concatenate([_expected(each, RIGID_FREEDOM) for each in share_of], axis=1),
+            apparent_scale=apparent_scale,
         )
 
     def _total(self, smoothed: Smoothed) -> Floats:

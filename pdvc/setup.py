@@ -165,7 +165,7 @@ def _bases(
     geometry: ConeBeam, window: tuple[int, int, int, int], hull: Hull, options: MeasureOptions
 ) -> tuple[SectionBasis, SectionBasis]:
     """Return the rigid basis, one section with the rigid motions that the sections can follow, and the sections."""
-    sections = section_basis(geometry, window, hull, options.sections, options.motions)
+    sections = section_basis(geometry, window, hull, options.sections_for(geometry.rows), options.motions)
     middle = np.array([(sections.height_mm[0] + sections.height_mm[-1]) / 2])
     single = {
         motion: SectionBasis(height_mm=middle, radius_mm=sections.radius_mm, motions=(motion,)) for motion in RIGID

@@ -212,9 +212,8 @@ def _fitted(
 
 
 def _of_all(noise: Propagated) -> Floats:
-    """Return V of each step, of all sources: what e may be wrong by is weighed as if drawn anew at each step."""
-    each = noise.systematic
-    return np.asarray(sum(noise.own.values()) + each[:, :, None] * each[:, None])
+    """Return V of each step, of all sources."""
+    return np.asarray(sum(noise.own.values()))
 
 
 def _known(fit: _Fit, noise: Propagated, slow: Floats, equations: Equations, shape: tuple[int, int]) -> Known:
@@ -235,12 +234,10 @@ def _known(fit: _Fit, noise: Propagated, slow: Floats, equations: Equations, sha
     for name, covariance in noise.own.items():
         draws = rng.standard_normal((*covariance.shape[:2], DRAWS))
         parts[name] = effect(fit.white @ (_root(covariance) @ draws), np.full(DRAWS, 1 / DRAWS))
+    parts["process"] = own - np.sum(list(parts.values()), axis=0)
     errors = np.einsum("tnm,tm->tn", fit.white, noise.systematic)[..., None]
-    anew = effect(errors * rng.standard_normal((steps, 1, DRAWS)), np.full(DRAWS, 1 / DRAWS))
-    parts["process"] = own - np.sum(list(parts.values()), axis=0) - anew
-    # e is wrong alike at all steps
     parts["systematic"] = effect(errors, np.ones(1))
-    own = own - anew + parts["systematic"]
+    own = own + parts["systematic"]
     metric = joined(matrix, slow)
     for name, each in noise.own.items():
         together = noise.parts[name]

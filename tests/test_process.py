@@ -143,7 +143,19 @@ class Case:
     def of_data(self, given: Deviations) -> np.ndarray:
         """Return the covariance of all data before they were taken."""
         x, _ = self.stacked()
-        return x @ self.prior(given) @ x.T + np.diag(np.repeat(given.misfit, self.seen.unknowns))
+        moved = self.prior(given) + self.apparent(given)
+        return x @ moved @ x.T + np.diag(np.repeat(given.misfit, self.seen.unknowns))
+
+    def apparent(self, given: Deviations) -> np.ndarray:
+        """Return the covariance (step * unknown, step * unknown) of apparent motions: each step by itself."""
+        steps, (shape, states) = len(self.time_s), self.space.to_amplitude.shape
+        total = np.zeros((steps, shape, steps, shape))
+        for t in range(steps):
+            for i in range(states):
+                of, group = self.space.to_amplitude[:, i], self.space.group[i]
+                size = given.apparent_voxel[group] ** 2 * given.apparent_scale[t, group]
+                total[t, :, t] += size * np.outer(of, of)
+        return total.reshape((steps * shape,) * 2)
 
     def expected(self, given: Deviations) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean (step, unknown) and the covariance of all amplitudes under the data."""
@@ -171,6 +183,8 @@ def deviations(rng: np.random.Generator, steps: int, names: tuple[str, ...]) -> 
         rigid_scale=around(1.0, bends * rigid).reshape(bends, rigid),
         own_scale=around(1.0, bends),
         misfit=around(1.0, steps),
+        apparent_voxel=around(0.2, groups),
+        apparent_scale=around(1.0, steps * groups).reshape(steps, groups),
     )
 
 
@@ -259,7 +273,7 @@ def minimised(one: Case, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.parametrize(("steps", "section_motions"), [(1, ALL), (2, TWO), (3, ALL), (7, ALL), (9, TWO)])
 def test_the_likelihood_s_slope_is_that_of_finite_differences(steps, section_motions, monkeypatch):
-    """Of each deviation q, each e and each r, with the broad priors of their logarithms."""
+    """Of each deviation q, each e, each n and each r, with the broad priors of their logarithms."""
     function, start = minimised(case(3, steps, section_motions), monkeypatch)
     _, slope = function(start)
     found = optimize.approx_fprime(start, lambda x: function(x)[0], 1e-6)
@@ -272,17 +286,20 @@ def test_what_is_minimised_is_the_likelihood_with_broad_priors(monkeypatch):
     groups, count = len(one.deviations.bend_voxel), len(ALL)
     np.testing.assert_allclose(np.exp(start[:groups]), one.deviations.bend_voxel)
     np.testing.assert_allclose(np.exp(start[groups : groups + count]), one.deviations.end_voxel)
-    np.testing.assert_allclose(start[groups + count :], one.deviations.roughness)
+    np.testing.assert_allclose(np.exp(start[groups + count : -count]), one.deviations.apparent_voxel)
+    np.testing.assert_allclose(start[-count:], one.deviations.roughness)
 
     def written_out(x):
         given = replace(
             one.deviations,
             bend_voxel=np.exp(x[:groups]),
             end_voxel=np.exp(x[groups : groups + count]),
-            roughness=x[groups + count :],
+            apparent_voxel=np.exp(x[groups + count : -count]),
+            roughness=x[-count:],
         )
-        broad = np.concatenate([(x[:groups] - np.log(0.01)) / 2.5, x[groups : groups + count] / 2.5])
-        rough = (x[groups + count :] - 1) / 0.5
+        typical = np.repeat([np.log(0.01), 0.0, np.log(0.003)], [groups, count, groups])
+        broad = (x[:-count] - typical) / 2.5
+        rough = (x[-count:] - 1) / 0.5
         return -one.log_density(given) + (broad @ broad + rough @ rough) / 2
 
     elsewhere = start + 0.3 * np.random.default_rng(5).normal(size=len(start))
@@ -308,6 +325,7 @@ def test_time_has_no_direction(seed, steps, section_motions):
             rigid_scale=given.rigid_scale[::-1],
             own_scale=given.own_scale[::-1],
             misfit=given.misfit[::-1],
+            apparent_scale=given.apparent_scale[::-1],
         ),
     )
     mean, covariance, smoothed = solved(one)
@@ -363,10 +381,12 @@ def test_a_step_alone_is_solved_under_the_prior_of_ends(seed, section_motions):
         spread = one.deviations.end_voxel[k] ** 2 * (value / value[0]) ** one.deviations.roughness[k]
         only = np.diag(np.eye(len(section_motions))[k])
         before += np.kron(along * spread @ along.T, only)
-    x, noise = one.seen.design[0], one.deviations.misfit[0]
-    information = np.linalg.inv(before) + x.T @ x / noise
+    x, noise = one.seen.design[0], one.deviations.misfit[0] * np.eye(one.seen.unknowns)
+    noise = noise + x @ one.apparent(one.deviations) @ x.T
+    weighed = np.linalg.solve(noise, x).T
+    information = np.linalg.inv(before) + weighed @ x
     np.testing.assert_allclose(covariance[0] @ information, np.eye(len(x)), atol=1e-6)
-    np.testing.assert_allclose(information @ mean[0], x.T @ one.seen.data[0] / noise, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(information @ mean[0], weighed @ one.seen.data[0], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("step", [0, 4, 8])
@@ -390,12 +410,14 @@ def test_a_step_without_data_is_less_known_and_those_near_it_a_little(step):
 @pytest.mark.parametrize("section_motions", [ALL, TWO], ids=["seven motions", "two motions"])
 def test_what_is_drawn_from_the_prior_is_covered_as_stated(section_motions):
     one = case(7, 7, section_motions)
-    root = np.linalg.cholesky(one.prior(one.deviations) + 1e-10 * np.eye(one.seen.data.size))
+    tiny = 1e-10 * np.eye(one.seen.data.size)
+    root, seeming = (np.linalg.cholesky(of(one.deviations) + tiny) for of in (one.prior, one.apparent))
     rng, squares = np.random.default_rng(8), []
     for _ in range(60):
         truth = (root @ rng.normal(size=len(root))).reshape(one.seen.data.shape)
         noise = np.sqrt(one.deviations.misfit)[:, None] * rng.normal(size=truth.shape)
-        data = np.einsum("tnm,tm->tn", one.seen.design, truth) + noise
+        apparent = (seeming @ rng.normal(size=len(root))).reshape(truth.shape)
+        data = np.einsum("tnm,tm->tn", one.seen.design, truth + apparent) + noise
         mean, covariance, _ = solved(replace(one, seen=replace(one.seen, data=data)))
         squares.append((mean - truth) ** 2 / np.einsum("tnn->tn", covariance))
     rms = np.sqrt(np.mean(squares, axis=0))
@@ -504,7 +526,12 @@ def test_any_amplitudes_can_be_followed(seed, section_motions):
 def drawn_history(seed: int, steps: int, bend_voxel: float, noise: float = 0.02):
     """Return a case of two motions, drawn with known deviations, whose radiographs tell each amplitude alike."""
     one = case(seed, steps, TWO, trend=0, tied=None, even=True)
-    truth = replace(one.space.first_guess(), bend_voxel=np.full_like(one.deviations.bend_voxel, bend_voxel))
+    guess = one.space.first_guess()
+    truth = replace(
+        guess,
+        bend_voxel=np.full_like(one.deviations.bend_voxel, bend_voxel),
+        apparent_voxel=0 * guess.apparent_voxel,
+    )
     root = np.linalg.cholesky(one.prior(truth) + 1e-12 * np.eye(one.seen.data.size))
     rng = np.random.default_rng(seed)
     amplitude = (root @ rng.normal(size=len(root))).reshape(one.seen.data.shape)
@@ -524,7 +551,8 @@ def test_deviations_are_found_in_a_long_history(bend_voxel):
     assert (np.abs(np.log(found.misfit)) < np.log(3)).all()
     away = one.process.amplitude(smoothed) - amplitude
     variance = np.einsum("tnn->tn", one.process.covariance(smoothed, inverse))
-    assert np.sqrt((away**2 / variance).mean()) == pytest.approx(1, abs=0.15)
+    # what bends ten times more than the noise may be apparent in part: intervals are then too wide, never narrow
+    assert 0.6 < np.sqrt((away**2 / variance).mean()) < 1.15
 
 
 def test_a_slip_is_found_where_it_is_and_the_radiographs_that_fit_badly():

@@ -48,7 +48,11 @@ def normal_equations(volume, rays, basis, amplitude, target, weight, *, voxel_mm
         volume, rays[None], basis, amplitude[None], target[None], weight[None], voxel_mm=voxel_mm
     )
     return StepEquations(
-        matrix=found.matrix[0], vector=found.vector[0], chi2=found.chi2[0], residual=found.residual[0]
+        matrix=found.matrix[0],
+        vector=found.vector[0],
+        chi2=found.chi2[0],
+        residual=found.residual[0],
+        blocks=found.blocks,
     )
 
 
@@ -325,6 +329,23 @@ def test_a_long_window_is_the_sum_of_its_parts():
     ]
     np.testing.assert_allclose(np.concatenate([part.residual for part in parts]), whole.residual, atol=1e-5)
     np.testing.assert_allclose(sum(part.matrix for part in parts), whole.matrix, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(("band", "block"), [(0, 0), (1, 1), (2, 2)])
+def test_the_right_hand_side_of_a_block_is_that_of_its_pixels_alone(band, block):
+    """Blocks of 16 x 16 pixels; those at the edges are smaller, and together they make the whole."""
+    volume, rays, amplitude = textured(), rays_at(0.8), motion(SECTIONS, 3)
+    unknowns = SECTIONS.shape[0] * SECTIONS.shape[1]
+    whole = normal_equations(volume, rays, SECTIONS, amplitude, BLANK, EVEN, voxel_mm=VOXEL_MM)
+    only = np.zeros_like(EVEN)
+    here = (slice(16 * band, 16 * band + 16), slice(16 * block, 16 * block + 16))
+    only[here] = 1
+    alone = normal_equations(volume, rays, SECTIONS, amplitude, BLANK, only, voxel_mm=VOXEL_MM)
+    found = np.zeros(2 * unknowns)
+    each = whole.blocks[0]
+    found[each.first[band] : each.first[band] + each.values.shape[2]] = each.values[band, block]
+    np.testing.assert_allclose(found[:unknowns], alone.vector, atol=1e-9 * np.abs(whole.vector).max())
+    assert not found[unknowns:].any()
 
 
 def test_a_wide_window_is_the_sum_of_its_columns():

@@ -127,7 +127,7 @@ def design_of_experiment(experiment: Experiment, options: MeasureOptions) -> Des
         turns=len(angle) / steps_per_turn,
         frames=experiment.frames,
         flats=len(experiment.flats),
-        sections=options.sections,
+        sections=options.sections_for(experiment.geometry.rows),
     )
 
 

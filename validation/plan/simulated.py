@@ -59,7 +59,7 @@ def design_of(scenario: Scenario, options: MeasureOptions) -> Design:
         turns=acquisition.test_steps / acquisition.steps_per_turn,
         frames=scenario.detector.frames,
         flats=scenario.detector.flats,
-        sections=options.sections,
+        sections=options.sections_for(scenario.geometry.rows),
     )
 
 

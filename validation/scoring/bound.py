@@ -1,13 +1,18 @@
 """The Cramer-Rao bound: the least random error that an unbiased measurement of a scenario's radiographs can have.
 
-The noise of each pixel is known and independent, its variance v(t, p) that of photons and readout. With S the
-sensitivities at the true motion and P the prior's precision, the information in the radiographs of the test is
+The noise of each pixel is known and independent, that of a radiograph of the test and that of the reference scan in
+the same direction, both of photons and readout:
+
+    v(t, p) = v_g(t, p) + sum_v a_tv^2 v_v(p)         a_tv: share of view v at the step (`pdvc.systematic`)
+
+The sample at rest is known no better than its reference scan shows it. The detector's fixed pattern is taken as known:
+all radiographs together tell it. With S the sensitivities at the true motion and P the prior's precision, the
+information is
 
     I = sum_t sigma(t) sigma(t)^T (x) S(t)^T diag(1 / v(t)) S(t) + P,          C >= I^-1
 
-The sample at rest is taken as known: the noise of the reference scan and of the flats is not in the bound, and is one
-of the reasons why a measurement stays above it. S is pdvc's own, from the scenario without any noise, so that what
-reconstruction blurs is missing in it; the radiographs are not filtered.
+S is pdvc's own, from the scenario without any noise, so that what reconstruction blurs is missing in it; the
+radiographs are not filtered. That steps a turn apart share the noise of a view is left out, which lowers the bound.
 
 Efficiency is the bound over the random error that was observed, both as standard deviations.
 """
@@ -26,7 +31,7 @@ from numpy.typing import NDArray
 from pdvc.deviations import Knowledge, Quantities
 from pdvc.equations import Images, joined, linearise
 from pdvc.experiment import Experiment, read_experiment
-from pdvc.noise import separate
+from pdvc.noise import mean_of_views, separate
 from pdvc.options import MeasureOptions
 from pdvc.preparation import prepare, stated_noise
 from pdvc.prior import solved
@@ -79,11 +84,18 @@ def _bound(experiment: Experiment, truth: TruePoints, options: MeasureOptions, p
     basis, time_functions = setup.sections, setup.time_functions()
     prepared = prepare(setup, 1, progress)
     noise = stated_noise(setup, prepared)
-    information = np.stack([1 / noise.step(t).variance for t in range(len(experiment.test))])
-    images = replace(prepared.images, weight=np.where(prepared.images.weight > 0, information, 0).astype(np.float32))
     voxel_mm = experiment.geometry.voxel_mm
     coefficients, _ = true_coefficients(basis, time_functions, voxel_mm, truth)
     amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)
+    systematic, images = prepared.systematic, prepared.images
+    sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, voxel_mm)
+    information = np.stack(
+        [
+            1 / (noise.step(t).variance + mean_of_views(noise, sight.of_step(t)).variance[systematic.window])
+            for t in range(len(amplitude))
+        ]
+    )
+    images = replace(images, weight=np.where(images.weight > 0, information, 0).astype(np.float32))
     return Knowledge(
         basis=basis,
         time_functions=time_functions,
