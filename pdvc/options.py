@@ -85,7 +85,7 @@ class MeasureOptions(Settings):
     discard_columns: Annotated[int, Field(ge=0)] | None = None
     """columns left out on the left and on the right, px; default: 60 of 432, or less for a wide sample"""
     sections: Annotated[int, Field(ge=2)] | None = None
-    """sections, equally spaced over the used height; default: 29, or fewer, so that each has 11 rows of the detector"""
+    """sections, equally spaced over the used height; default: 29, or fewer, for 11 rows of the detector each"""
     section_motions: tuple[str, ...] = names_of((*RIGID, CONTRACTION))
     """motions of a section: six rigid ones, and contraction"""
     time: tuple[TimeFunction, ...] = (*PAPER[:3], Ramp(powers=(0, 1, 2, 3)))
