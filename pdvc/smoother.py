@@ -52,10 +52,8 @@ RANK = 300
 """Directions of noise common to steps that are followed, the largest."""
 WEAK = 1e-6
 """Ridge of the metric, over its diagonal."""
-STRANGE = 100.0
-"""Scale of apparent motion from which on a radiograph is told: ten times the typical deviation."""
 EVENT = 25.0
-"""Scale of bends from which on a step is told as an event: five times the typical bend."""
+"""Scale of bends or of apparent motion from which on a step is told: five times what is typical."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,7 +299,7 @@ def _in_words(deviations: Deviations) -> str:
     events = np.flatnonzero(np.maximum(deviations.rigid_scale.max(axis=1), deviations.own_scale) > EVENT) + 1
     if len(events):
         said += f", far larger at step {listed(events.tolist())}"
-    strange = np.flatnonzero(deviations.apparent_scale.max(axis=1) > STRANGE) + 1
+    strange = np.flatnonzero(deviations.apparent_scale.max(axis=1) > EVENT) + 1
     if len(strange):
         said += f"; radiographs that tell another motion than their neighbours: step {listed(strange.tolist())}"
     return said

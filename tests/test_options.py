@@ -35,6 +35,12 @@ def scales(stages):
     [(954, 432, 8), (238, 108, 2)],
     ids=["the paper's detector", "a quarter of it"],
 )
+@pytest.mark.parametrize(("rows", "sections"), [(954, 29), (320, 29), (318, 28), (238, 21), (33, 3), (10, 2)])
+def test_there_are_as_many_sections_as_rows_allow_unless_a_number_is_asked_for(rows, sections):
+    assert MeasureOptions().sections_for(rows) == sections
+    assert MeasureOptions(sections=7).sections_for(rows) == 7
+
+
 def test_the_scales_left_open_follow_the_detector(rows, columns, coarse):
     options = resolved_for(MeasureOptions(), rows, columns)
     assert options.scales == tuple(sorted({coarse, 2, 1}, reverse=True))

@@ -93,6 +93,16 @@ def test_noise_that_differs_from_step_to_step_is_no_pattern():
     assert pattern.grey.std() < 1.5 * OWN / np.sqrt(STEPS)
 
 
+def test_a_smooth_misfit_is_left_to_the_motion():
+    """What an error of the motion leaves in the mean over all steps is smooth over pixels: no noise of flats."""
+    row, column = np.indices(SHAPE) - np.array(SHAPE)[:, None, None] / 2
+    misfit = 2 * SLOPE * RELATIVE * np.exp(-(row**2 + column**2) / (2 * 8.0**2))
+    images, systematic = seen(np.zeros(SHAPE, np.float32))
+    images = replace(images, grey=(images.grey + misfit).astype(np.float32))
+    pattern, _ = found(images, systematic)
+    assert np.abs(pattern.grey).max() < 0.15 * misfit.max()
+
+
 def test_what_is_far_more_than_the_flats_noise_is_left():
     """A thing that stands in the beam is no noise of the flats."""
     psi = drawn()
