@@ -174,7 +174,7 @@ def propagate(
             for t, (moved, shared) in zip(steps, pool.map(add_step, steps, fields, left), strict=True):
                 held[t] = moved
                 if pile is not None:
-                    pile.add(t, shared)
+                    pile.add(t, shared, pool)
             together = [(t, other, shares) for t in steps for other, shares in company[t].items()]
             list(pool.map(add_pair, *zip(*together, strict=True))) if together else None
             later = {other for t in order[done + len(steps) :] for other in company[t]}

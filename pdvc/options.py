@@ -40,15 +40,17 @@ Scale = Annotated[int, Field(ge=1, le=16)]
 class StageOptions(Settings):
     """One stage of the protocol: at which scale, and by which solver."""
 
-    scale: Scale | Literal["coarse"] = 1
-    """pixels binned into one; coarse: the largest power of two that leaves about a hundred rows"""
+    scale: Scale | Literal["coarse", "middle"] = 1
+    """pixels binned into one; coarse: the largest power of two that leaves about a hundred rows; middle: half of it"""
     solver: Solver = Pgd()
     """pgd, gauss-newton or smoother, each with its own limits"""
 
     def at(self, geometry: ConeBeam) -> ResolvedStage:
         """Return the stage with its scale as a number, for a detector."""
-        scale = coarse_scale(geometry) if self.scale == "coarse" else self.scale
-        return ResolvedStage(scale=scale, solver=self.solver)
+        if isinstance(self.scale, int):
+            return ResolvedStage(scale=self.scale, solver=self.solver)
+        coarse = coarse_scale(geometry)
+        return ResolvedStage(scale=coarse if self.scale == "coarse" else max(coarse // 2, 2), solver=self.solver)
 
 
 class ResolvedStage(StageOptions):
@@ -68,6 +70,7 @@ COARSE_TO_FINE_RIGID = (
     StageOptions(scale=2, solver=GaussNewton(most_passes=4)),
 )
 COARSE_TO_FINE = (
+    StageOptions(scale="middle", solver=GaussNewton(most_passes=6)),
     StageOptions(scale=2, solver=GaussNewton(most_passes=4)),
     StageOptions(scale=1, solver=Smoother()),
 )

@@ -78,7 +78,7 @@ def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:
     used = geometry.cropped(*part)
     view = _viewer(experiment.reference, setup.calibration, scale, options.smooth_px)
     volume = reference_volume(setup, scale, progress)
-    systematic = _systematic(experiment, geometry, part, view, volume, setup.sections.radius_mm)
+    systematic = _systematic(experiment, geometry, part, view, volume, setup.sections.radius_mm, scale)
     grey, variance = _test_radiographs(experiment, setup.calibration, part, scale, options.smooth_px, progress)
     good = ~_coarse_bad(setup.calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
     if not good.any():
@@ -204,10 +204,12 @@ def _systematic(
     view: Callable[[int], Image],
     volume: Volume,
     radius_mm: float,
+    scale: int,
 ) -> Systematic:
     """Return what re-projecting the volume leaves; views are re-projected as steps are found to look along them.
 
-    `radius_mm`, half of half the section's diagonal, tells within which angle e changes.
+    `radius_mm`, half of half the section's diagonal, tells within which angle e changes. It changes the slower the
+    larger the pixels are: at scale n every n-th view tells it.
     """
     shape = (geometry.rows, geometry.columns)
     reached = reached_rows(geometry, volume.grid, volume.hull)
@@ -220,8 +222,8 @@ def _systematic(
         return field
 
     return Systematic(
-        left=left,
-        view_rad=experiment.reference.angle_rad,
+        left=lambda i: left(i * scale),
+        view_rad=experiment.reference.angle_rad[::scale],
         step_rad=experiment.test.angle_rad,
         corner=(part[0], part[2]),
         shape=(part[1] - part[0], part[3] - part[2]),

@@ -7,6 +7,7 @@ in its place, R^T S where a reference view was moved (`pdvc.systematic`), and su
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 
 import numpy as np
 from numba import njit
@@ -50,13 +51,18 @@ class Pile:
         self._first: dict[int, int] = {}
         self._blocks: dict[int, Image] = {}
 
-    def add(self, step: int, field: Sensitivities) -> None:
-        """Add a step's field over the detector."""
-        for block in range((len(field.values) - 1) // _BLOCK_ROWS + 1):
+    def add(self, step: int, field: Sensitivities, pool: Executor | None = None) -> None:
+        """Add a step's field over the detector; with a pool, blocks of rows side by side."""
+
+        def add_block(block: int) -> None:
             rows = slice(block * _BLOCK_ROWS, min((block + 1) * _BLOCK_ROWS, len(field.values)))
             z, first = self._room_for(block, field, rows)
             offset = (field.first[rows] - first) * self._motions
             _pile_up(z, field.values[rows], offset, self._functions[:, step])
+
+        blocks = range((len(field.values) - 1) // _BLOCK_ROWS + 1)
+        for _ in (map if pool is None else pool.map)(add_block, blocks):
+            pass
 
     def _room_for(self, block: int, field: Sensitivities, rows: slice) -> tuple[Image, int]:
         """Return a block of pixels (row, column, function, section * motion), wide enough, and its first section."""

@@ -71,6 +71,12 @@ class _Fit:
         """Return amplitudes (step, unknown), voxels."""
         return self.process.amplitude(self.smoothed)
 
+    @property
+    def deviation(self) -> Floats:
+        """Return their standard deviations (step, unknown), voxels, never zero."""
+        variance = np.einsum("tnn->tn", self.process.covariance(self.smoothed, self.smoothed.factor.inverted()))
+        return np.asarray(np.sqrt(np.maximum(variance, 1e-300)))
+
 
 class Smoother(Solver):
     """A motion of any history, smooth over the steps as far as the data say so."""
@@ -79,8 +85,8 @@ class Smoother(Solver):
     """any history: each step from the radiographs of all, by a Gaussian process over the steps"""
     most_passes: Annotated[int, Field(ge=1)] = 4
     """largest number of steps, each a pass over all radiographs"""
-    least_change_voxel: Annotated[float, Field(gt=0)] = 2e-3
-    """converged: the displacement changes by less than this, voxel rms"""
+    least_change: Annotated[float, Field(gt=0)] = 0.2
+    """converged: amplitudes change by less than this share of their standard deviations, rms"""
     trend: tuple[TimeFunction, ...] = (Angle(),)
     """time functions of the rigid motion of the whole sample, beside the process"""
     bend_voxel: Annotated[float, Field(ge=1e-5)] | Literal["fit"] = "fit"
@@ -113,13 +119,15 @@ class Smoother(Solver):
         for _ in range(self.most_passes):
             with _one_thread():
                 fit = _fitted(spaces, equations, noise, amplitude, deviations, rounds)
-            deviations, rounds = fit.deviations, min(rounds, 1)
+                deviation = fit.deviation
+            deviations, rounds = fit.deviations, 1 if rounds > 1 else 0
             moved, trial = self._carefully(problem, equations, amplitude, fit.amplitude)
-            last = float(np.sqrt(np.mean((moved - amplitude) ** 2)))
+            last, share = _rms(moved - amplitude), _rms((moved - amplitude) / deviation)
             amplitude, equations = moved, trial
             rms.append(equations.rms)
-            if last < self.least_change_voxel:
-                stop, reason = Stop.CONVERGED, f"converged: the last change was {last:.2g} voxel rms"
+            if share < self.least_change:
+                changed = f"the last change was {last:.2g} voxel rms, {share:.2g} of the standard deviations"
+                stop, reason = Stop.CONVERGED, f"converged: {changed}"
                 break
         with _one_thread():
             fit = _fitted(spaces, equations, noise, amplitude, deviations, 0)
@@ -163,6 +171,10 @@ class Smoother(Solver):
             if trial.chi2.sum() <= now.chi2.sum() * (1 + WORSE):
                 break
         return moved, trial
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _one_thread() -> threadpool_limits:
