@@ -40,19 +40,19 @@ def by_block(blocks: Sequence[BlockVectors], weighed: Floats, slow: Floats) -> F
     return total
 
 
-def excess(moved: Floats, expected: Floats, shape: tuple[int, int]) -> Floats:
+def excess(squares: Floats, expected: Floats, shape: tuple[int, int]) -> Floats:
     """Return by what blocks make the variance of amplitudes larger than noise does, at least one (motion,).
 
-    `moved` (step, unknown, block) is what each block does; `expected` (step, unknown) the variance that noise makes;
-    unknowns are of `shape` (section, motion). The solution has made the sum over n blocks nearly zero, which takes
-    1 / n of it. Ratios are of all steps and sections together: one that few blocks see is not known well.
+    `squares` (unknown, block) of what each block does, summed over the steps; `expected` (unknown,) the variance that
+    noise makes, likewise; unknowns are of `shape` (section, motion). The solution has made the sum over n blocks
+    nearly zero, which takes 1 / n of it. Ratios are of all sections together: one that few blocks see is not known
+    well.
     """
-    squares = (moved**2).sum(axis=0)
     seen = squares.sum(axis=1)
     count = seen**2 / np.maximum((squares**2).sum(axis=1), 1e-300)
     told = count > FEWEST
     variance = np.where(told, seen * count / np.maximum(count - 1, 1), 0).reshape(shape).sum(axis=0)
-    noise = np.where(told, expected.sum(axis=0), 0).reshape(shape).sum(axis=0)
+    noise = np.where(told, expected, 0).reshape(shape).sum(axis=0)
     return np.asarray(np.maximum(variance / np.maximum(noise, 1e-300), 1.0))
 
 

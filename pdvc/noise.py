@@ -158,10 +158,11 @@ def propagate(
             believed[step] = BELIEF * adjoint(weighted, left, unknowns)
         return moved, shared
 
-    def add_pair(step: int, other: int, shares: Mapping[int, float]) -> None:
-        """Add what the noise of the views does that two steps both look along."""
+    def joint_of(pair: tuple[int, int, Mapping[int, float]]) -> Floats:
+        """Return what the noise of the views does that two steps both look along."""
+        step, other, shares = pair
         variance = np.sum([share * noise.view(view).variance for view, share in shares.items()], axis=0)
-        pairs[step, other] = product(held[step], held[other], variance, unknowns)
+        return product(held[step], held[other], variance, unknowns)
 
     company = _company(sight, apart)
     order = list(company)
@@ -176,18 +177,20 @@ def propagate(
                 if pile is not None:
                     pile.add(t, shared, pool)
             together = [(t, other, shares) for t in steps for other, shares in company[t].items()]
-            list(pool.map(add_pair, *zip(*together, strict=True))) if together else None
+            # in this order, whichever is ready first: sums over pairs are to have the same bits
+            for (t, other, _), joint in zip(together, pool.map(joint_of, together), strict=True):
+                pairs[t, other] = joint
             later = {other for t in order[done + len(steps) :] for other in company[t]}
             held = {step: field for step, field in held.items() if step in later}
             progress("uncertainty", done + len(steps), len(amplitude))
-    joint = {
+    parts = {
         "radiographs": _joined(own["radiographs"], {}, time_functions),
         "views": _joined(own["views"], pairs, time_functions),
         "flats": _joined(own["flats"], {}, time_functions) if pile is None else pile.covariance(noise.flat, unknowns),
     }
     common = time_functions @ believed
-    joint["systematic"] = common[:, :, None] * common[:, None] if apart else np.outer(common.ravel(), common.ravel())
-    return Propagated(parts=joint, own=own, systematic=believed)
+    parts["systematic"] = common[:, :, None] * common[:, None] if apart else np.outer(common.ravel(), common.ravel())
+    return Propagated(parts=parts, own=own, systematic=believed)
 
 
 def separate(time_functions: Floats) -> bool:

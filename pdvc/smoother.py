@@ -279,8 +279,10 @@ def _of_image_model(fit: _Fit, slow: Floats, blocks: tuple[BlockVectors, ...], s
     draws = np.random.default_rng(0).standard_normal((*design.shape[:2], DRAWS))
     noise = effect(np.einsum("ft,tnd->fnd", slow, turned @ draws))
     covariance = noise @ noise.transpose(0, 2, 1) / DRAWS
-    seen = effect(by_block(blocks, turned @ fit.white, slow))
-    more = excess(seen, np.einsum("tnn->tn", covariance), shape)
+    z = by_block(blocks, turned @ fit.white, slow)
+    some = (z[..., start : start + DRAWS] for start in range(0, z.shape[2], DRAWS))
+    squares = np.concatenate([(effect(each) ** 2).sum(axis=0) for each in some], axis=1)
+    more = excess(squares, np.einsum("tnn->n", covariance), shape)
     factor = np.sqrt(np.tile(more, shape[0]))
     return np.asarray(covariance * (np.outer(factor, factor) - 1))
 
@@ -311,7 +313,7 @@ def _in_words(deviations: Deviations) -> str:
     events = np.flatnonzero(np.maximum(deviations.rigid_scale.max(axis=1), deviations.own_scale) > EVENT) + 1
     if len(events):
         said += f", far larger at step {listed(events.tolist())}"
-    strange = np.flatnonzero(deviations.apparent_scale.max(axis=1) > EVENT) + 1
+    strange = np.flatnonzero(deviations.apparent_scale.max(axis=1) > EVENT)
     if len(strange):
         said += f"; radiographs that tell another motion than their neighbours: step {listed(strange.tolist())}"
     return said

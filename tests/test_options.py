@@ -30,22 +30,22 @@ def scales(stages):
     return [stage.scale for stage in stages]
 
 
-@pytest.mark.parametrize(
-    ("rows", "columns", "coarse"),
-    [(954, 432, 8), (238, 108, 2)],
-    ids=["the paper's detector", "a quarter of it"],
-)
 @pytest.mark.parametrize(("rows", "sections"), [(954, 29), (320, 29), (318, 28), (238, 21), (33, 3), (10, 2)])
 def test_there_are_as_many_sections_as_rows_allow_unless_a_number_is_asked_for(rows, sections):
     assert MeasureOptions().sections_for(rows) == sections
     assert MeasureOptions(sections=7).sections_for(rows) == 7
 
 
+@pytest.mark.parametrize(
+    ("rows", "columns", "coarse"),
+    [(954, 432, 8), (238, 108, 2)],
+    ids=["the paper's detector", "a quarter of it"],
+)
 def test_the_scales_left_open_follow_the_detector(rows, columns, coarse):
     options = resolved_for(MeasureOptions(), rows, columns)
-    assert options.scales == tuple(sorted({coarse, 2, 1}, reverse=True))
+    assert options.scales == tuple(sorted({coarse, max(coarse // 2, 2), 2, 1}, reverse=True))
     assert scales(options.rigid) == [coarse, 2]
-    assert scales(options.deformation) == [2, 1]
+    assert scales(options.deformation) == [max(coarse // 2, 2), 2, 1]
 
 
 @pytest.mark.parametrize(
@@ -60,6 +60,7 @@ def test_what_is_given_stays():
     options = MeasureOptions(
         discard_rows=0,
         discard_columns=7,
+        sections=12,
         rigid=(StageOptions(scale=3),),
         deformation=(StageOptions(solver=Pgd(most_modes=1)),),
     )
@@ -144,10 +145,12 @@ def test_the_paper_s_options_are_the_paper_s():
     assert options.subtract_systematic
     assert options.smooth_px == 0
     assert not options.sharpen
+    assert not options.remove_pattern
 
 
 def test_by_default_the_last_stage_smooths_and_the_views_are_sharpened():
     options = MeasureOptions()
-    assert [stage.solver.kind for stage in options.deformation] == ["pgd", "smoother"]
+    assert [stage.solver.kind for stage in options.deformation] == ["gauss-newton", "gauss-newton", "smoother"]
+    assert options.remove_pattern
     assert options.deformation[-1].scale == 1
     assert options.sharpen

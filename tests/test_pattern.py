@@ -78,7 +78,9 @@ def test_what_is_left_of_its_variance_is_as_stated(smooth_px):
     images, systematic = seen(psi, OWN * noise_overlap(smooth_px)[0])
     pattern, _ = found(images, systematic, noise(smooth_px))
     own = 2 * OWN**2 / STEPS
-    expected = own / ((SLOPE * RELATIVE) ** 2 + own)
+    found_of_it = (SLOPE * RELATIVE) ** 2 / ((SLOPE * RELATIVE) ** 2 + own)
+    # but for what a Gaussian of 3 px keeps of white noise
+    expected = 1 - found_of_it * (1 - 1 / (4 * np.pi * 9))
     np.testing.assert_allclose(pattern.left, expected, rtol=1e-5)
     before, after = (
         residuals(each, SECTIONS, AMPLITUDE) for each in (images, cleaned(images, systematic, pattern.grey))

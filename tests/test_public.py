@@ -292,7 +292,7 @@ def test_the_own_design_of_a_laboratory_is_what_it_planned(angle_deg):
     angle, steps = np.deg2rad(angle_deg), len(angle_deg)
     series = SimpleNamespace(angle_rad=angle, time_s=2.0 * np.arange(steps), force_N=np.linspace(250, 700, steps))
     test = _Sized(series, steps)
-    geometry = SimpleNamespace(voxel_mm=0.05)
+    geometry = SimpleNamespace(voxel_mm=0.05, rows=120)
     experiment = SimpleNamespace(test=test, frames=2, flats=np.zeros(3), geometry=geometry)
     own = design_of_experiment(experiment, MeasureOptions())
     same = planned_like(experiment, own, own)
@@ -338,4 +338,5 @@ def test_a_laboratory_plans_from_its_reference_scan(tmp_path):
     rows = [line.split(",") for line in (tmp_path / "real.csv").read_text().splitlines()]
     flats, vertical = rows[0].index("flats"), rows[0].index("std_vertical")
     most = max(rows[1:], key=lambda row: int(row[flats]))
-    assert float(most[vertical]) < 0.95 * real["std_vertical"]  # more flats help: they do not cancel
+    # more flats help: they do not cancel, though most of their noise is found in the radiographs
+    assert 0.9 * real["std_vertical"] < float(most[vertical]) < real["std_vertical"]

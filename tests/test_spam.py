@@ -221,7 +221,7 @@ def test_the_method_measures_the_scans_that_spam_finds(held, tmp_path, monkeypat
     measurement = method.measure(read_experiment(held))
     assert "step 12: 405 of 500 nodes converged" in measurement.fit.stages[0].stop_reason
     assert "step 24: spam-reg did not converge" in measurement.fit.stages[0].stop_reason
-    assert {spacing for _, _, spacing in asked} == {2}  # half the distance of two sections
+    assert {spacing for _, _, spacing in asked} == {5}  # half the distance of two sections
     known = np.isfinite(measurement.motion.amplitude[:, measurement.motion.observed]).all(axis=(1, 2))
     np.testing.assert_array_equal(np.flatnonzero(known), [12])
     scores = score(measurement, truth)

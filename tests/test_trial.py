@@ -34,7 +34,7 @@ def test_sharing_changes_nothing(tmp_path):
     now = stamps(tmp_path / "shared")
     # reference stack, outline and volumes were found; only the test's radiographs and its modes are new
     assert {name: now[name] for name in kept} == kept
-    assert {name.split("-")[0] for name in now.keys() - kept.keys()} == {"test", "stage"}
+    assert {name.split("-")[0] for name in now.keys() - kept.keys()} == {"test", "stage", "pattern"}
     assert not list((tmp_path / "shared").glob("experiment-*"))
     self_consistent(shared)
 

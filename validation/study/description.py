@@ -230,8 +230,12 @@ def _at(factor: Factor, share: float, base: dict[str, Any]) -> Combination:
         value = float(np.exp(np.log(factor.low) + share * np.log(factor.high / factor.low)))
     else:
         value = factor.low + share * (factor.high - factor.low)
-    kind = type(_look_up(base, factor.keys[0]))
-    said = round(value) if kind is int else value
+    usual = _look_up(base, factor.keys[0])
+    # a number that is left open may be a whole one: the limits tell
+    whole = isinstance(usual, int) or (
+        usual is None and factor.low == int(factor.low) and factor.high == int(factor.high)
+    )
+    said = round(value) if whole else value
     return Combination(changes=((factor.keys[0], said),), factors={factor.column: said})
 
 
