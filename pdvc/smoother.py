@@ -46,6 +46,8 @@ WORSE = 1e-3
 """A step that raises chi2 by more than this share is shortened: amplitudes under a prior may fit a little less."""
 SLOW_DEGREE = 4
 """Degree of the polynomials among the functions Psi."""
+COHERENT_DEGREE = 8
+"""The same of those in which the image model's errors are followed: texture passes a pixel within some ten steps."""
 DRAWS = 64
 """Draws of each source of noise that tell its part."""
 RANK = 300
@@ -131,7 +133,13 @@ class Smoother(Solver):
                 break
         with _one_thread():
             fit = _fitted(spaces, equations, noise, amplitude, deviations, 0)
-            known = _known(fit, noise, slow, equations, problem.basis.shape)
+            known = _known(fit, noise, slow, equations.matrix)
+            if equations.blocks and steps > COHERENT_DEGREE + 2:
+                finer = slow_functions(problem, COHERENT_DEGREE)
+                missed = _of_image_model(fit, finer, equations.blocks, problem.basis.shape) / steps
+                known = Known(
+                    covariance=known.covariance + missed, by_source={**known.by_source, "image model": missed}
+                )
         return Solution(
             coefficients=amplitude.reshape(steps, *shape) / np.sqrt(steps),
             equations=equations,
@@ -182,9 +190,9 @@ def _one_thread() -> threadpool_limits:
     return threadpool_limits(limits=1, user_api="blas")
 
 
-def slow_functions(problem: Problem) -> Floats:
-    """Return Psi (function, step), orthonormal: what noise that steps have in common is followed in."""
-    parts = (Polynomial(degree=min(SLOW_DEGREE, len(problem.series) - 1)), Angle())
+def slow_functions(problem: Problem, degree: int = SLOW_DEGREE) -> Floats:
+    """Return Psi (function, step), orthonormal: what errors that steps have in common are followed in."""
+    parts = (Polynomial(degree=min(degree, len(problem.series) - 1)), Angle())
     return time_basis(parts, problem.series)
 
 
@@ -226,12 +234,12 @@ def _of_all(noise: Propagated) -> Floats:
     return np.asarray(sum(noise.own.values()))
 
 
-def _known(fit: _Fit, noise: Propagated, slow: Floats, equations: Equations, shape: tuple[int, int]) -> Known:
+def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
     """Return the covariance of the amplitudes over the square root of the steps, and what makes it.
 
-    `shape` of the unknowns is (section, motion).
+    `matrix` is B (step, unknown, unknown). What the model of the image misses over many steps is not in it.
     """
-    process, matrix, steps = fit.process, equations.matrix, len(equations.matrix)
+    process, steps = fit.process, len(matrix)
     own = process.covariance(fit.smoothed, fit.smoothed.factor.inverted())
 
     def effect(errors: Floats, weight: Floats) -> Floats:
@@ -258,9 +266,6 @@ def _known(fit: _Fit, noise: Propagated, slow: Floats, equations: Equations, sha
             left = effect(process.seen.design @ moved, weight)
             parts[name] = parts[name] + left
             own = own + left
-    if equations.blocks and steps > SLOW_DEGREE:
-        parts["image model"] = _of_image_model(fit, slow, equations.blocks, shape)
-        own = own + parts["image model"]
     return Known(covariance=own / steps, by_source={name: part / steps for name, part in parts.items()})
 
 
