@@ -16,6 +16,10 @@ and that of each step alone W_Psi = sum_t Psi Psi^T (x) V(t). With H = sum_t Psi
 
 of coefficients g, and each direction v_k does to the amplitudes what data y = X sum_i Psi_i v_ki would. Noise that
 cancels between steps has a negative lambda. Draws of the noise of each step tell what each source makes.
+
+What the model of the image misses at a step alone is an apparent motion of the process (`pdvc.apparent`); what it
+misses over many steps is told by blocks of the residual (`pdvc.coherent`): they move the amplitudes more than noise
+would.
 """
 
 from __future__ import annotations
