@@ -1,8 +1,9 @@
 """Efficiency of the weighted direct solve on `in-space`, and what the rest is: python -m benchmarks.efficiency.
 
-For each noise: the Cramer-Rao bound, the reference scan counted as data; what the standard deviation would be if only the radiographs of the test were
-noisy, then with the noise of the reference views, then with that of the flats, which is what the measurement states
-(the shares are those on the axis, at the sections); and the scatter over noise draws, and the bias that they leave.
+For each noise: the Cramer-Rao bound, the reference scan counted as data; what the standard deviation would be if only
+the radiographs of the test were noisy, then with the noise of the reference views, then with that of the flats, which
+is what the measurement states (the shares are those on the axis, at the sections); and the scatter over noise draws,
+and the bias that they leave.
 All in voxels, rms over material points and steps. Efficiency is bound over scatter. Some 4 minutes on 2 cores.
 """
 
