@@ -110,6 +110,20 @@ def test_the_mean_over_views_is_as_wide_as_half_a_pixel_at_the_section_s_edge():
         assert width * setup.sections.radius_mm == pytest.approx(0.5 * scale * setup.geometry.voxel_mm)
 
 
+def test_a_pattern_is_taken_from_all_images_alike():
+    """From radiographs and views; what re-projection leaves of the views grows by it, as the volume stays."""
+    prepared = prepare(set_up(SMALL.experiment, SMALL.options), 1)
+    pattern = np.random.default_rng(1).normal(size=prepared.systematic.detector).astype(np.float32)
+    found = prepared.without(pattern)
+    taken = prepared.images.grey - found.images.grey
+    window = np.broadcast_to(pattern[prepared.systematic.window], taken.shape)
+    np.testing.assert_allclose(taken, window, atol=1e-5)
+    np.testing.assert_allclose(prepared.view(2) - found.view(2), pattern, atol=1e-5)
+    left = found.images.systematic.left(2) - prepared.systematic.left(2)
+    np.testing.assert_allclose(left, pattern, atol=1e-5)
+    np.testing.assert_array_equal(found.systematic.left(2), found.images.systematic.left(2))
+
+
 def test_the_snr_of_re_projection_is_that_of_the_views_that_steps_look_along():
     """At rest those on both sides of each step's angle; of a sample that turned by a right angle, others."""
     setup = set_up(SMALL.experiment, SMALL.options)

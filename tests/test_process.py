@@ -546,6 +546,9 @@ def test_deviations_are_found_in_a_long_history(bend_voxel):
     found = one.process.fitted(one.space.first_guess())
     smoothed = one.process.smoothed(found)
     inverse = smoothed.factor.inverted()
+    # with neighbours on one side only, what a radiograph tells is taken for a motion
+    np.testing.assert_array_equal(found.apparent_scale[[0, -1]], 1)
+    assert not np.isclose(found.apparent_scale[1:-1], 1, atol=1e-6).all()
     own = found.bend_voxel[one.space.rigid :]
     assert (np.abs(np.log(own / bend_voxel)) < np.log(2)).all()
     assert (np.abs(np.log(found.misfit)) < np.log(3)).all()
