@@ -22,6 +22,9 @@ from pdvc.projection import BlockVectors
 
 Floats = NDArray[np.float64]
 
+FEWEST = 2.0
+"""Blocks, as if they were alike, that an unknown has to be seen in to count."""
+
 
 def by_block(blocks: Sequence[BlockVectors], weighed: Floats, slow: Floats) -> Floats:
     """Return z_b (function, unknown, block).
@@ -54,7 +57,3 @@ def excess(squares: Floats, expected: Floats, shape: tuple[int, int]) -> Floats:
     variance = np.where(told, seen * count / np.maximum(count - 1, 1), 0).reshape(shape).sum(axis=0)
     noise = np.where(told, expected, 0).reshape(shape).sum(axis=0)
     return np.asarray(np.maximum(variance / np.maximum(noise, 1e-300), 1.0))
-
-
-FEWEST = 2.0
-"""Blocks, as if they were alike, that an unknown has to be seen in to count."""

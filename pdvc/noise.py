@@ -51,6 +51,7 @@ BELIEF = 0.1
 """Share of e that it may be wrong by, alike everywhere: what re-projection leaves of paths a little other than those
 of the reference scan is known no better."""
 _STEPS_AT_ONCE = 4
+"""Fewer than in a pass: the sensitivities of each are kept, in the window and over the detector."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -82,7 +82,8 @@ class Pile:
         """Return sum_p v(p) z(p) z(p)^T (function * unknown, function * unknown)."""
         functions = len(self._functions)
         total = np.zeros((functions, unknowns, functions, unknowns))
-        for block, z in self._blocks.items():
+        # from the top down, whichever a pool began with: the sum is to have the same bits
+        for block, z in sorted(self._blocks.items()):
             rows = slice(block * _BLOCK_ROWS, min((block + 1) * _BLOCK_ROWS, self._shape[0]))
             flat = (z[: rows.stop - rows.start] * np.sqrt(variance[rows])[..., None, None]).reshape(-1, z[0, 0].size)
             product = (flat.T @ flat).reshape(functions, z.shape[3], functions, z.shape[3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +12,11 @@ from pdvc.equations import linearise
 from pdvc.measurement import ResidualTests
 from pdvc.noise import ImageNoise, Noise, Propagated, known_from_residual, propagate, separate
 from pdvc.prior import Prior
-from pdvc.projection import sensitivities
+from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import smoothed
 from pdvc.rays import ray_vectors
 from pdvc.residual_tests import residual_tests
+from pdvc.sensitivity_sums import Pile
 from pdvc.systematic import Systematic
 from pdvc.uncertainty import posterior
 from tests.small_case import ANGLES, SCANNER, SECTIONS, SHAPE, STEPS, VOXEL_MM, motion, radiographs, time_functions
@@ -266,3 +268,24 @@ def test_the_sources_add_up_to_the_whole_covariance():
     np.testing.assert_allclose(sum(sources.values()), whole, rtol=1e-6, atol=1e-9 * whole.max())
     # each of them matters here, so that none is lost unseen
     assert all(np.trace(part) > 0.02 * np.trace(whole) for name, part in sources.items() if name != "systematic")
+
+
+class LastFirst(Executor):
+    """A pool of which the last is ready first."""
+
+    def map(self, make, *asked, **others):
+        return reversed([make(*each) for each in reversed(list(zip(*asked, strict=True)))])
+
+
+def test_a_pile_has_the_same_bits_whichever_block_a_pool_begins_with():
+    shape, functions = (64, 7), np.random.default_rng(2).normal(size=(2, 3))
+    found = []
+    for pool in (None, LastFirst()):
+        rng = np.random.default_rng(3)
+        pile = Pile(shape, functions, 2)
+        for step in range(3):
+            # from row to row far larger, so that sums in double precision are rounded
+            values = (rng.normal(size=(*shape, 6)) * np.geomspace(1, 1e9, 64)[:, None, None]).astype(np.float32)
+            pile.add(step, Sensitivities(values=values, first=np.zeros(64, dtype=np.int64), motions=2), pool)
+        found.append(pile.covariance(np.full(shape, 0.1, dtype=np.float32), 6))
+    np.testing.assert_array_equal(found[0], found[1])

@@ -232,9 +232,7 @@ def _at(factor: Factor, share: float, base: dict[str, Any]) -> Combination:
         value = factor.low + share * (factor.high - factor.low)
     usual = _look_up(base, factor.keys[0])
     # a number that is left open may be a whole one: the limits tell
-    whole = isinstance(usual, int) or (
-        usual is None and factor.low == int(factor.low) and factor.high == int(factor.high)
-    )
+    whole = type(usual) is int or (usual is None and factor.low == int(factor.low) and factor.high == int(factor.high))
     said = round(value) if whole else value
     return Combination(changes=((factor.keys[0], said),), factors={factor.column: said})
 
