@@ -1,12 +1,16 @@
 """Beam-hardening polynomial and hull, both from a coarse reconstruction of the reference views themselves.
 
 A polychromatic beam loses its soft part first, so that attenuation q grows less than the path length L through the
-sample. With the sample's outline found in a coarse volume, L is known for every ray, and
+sample. With the sample's outline found in a coarse volume, L is known for every ray. Nodules and photons scatter q,
+and not L: q is fitted to L by least squares, and the curve is turned round,
 
-    L ~ c1 q + c2 q^2 + c3 q^3                                       (third order, as in section 4.1)
+    q ~ a1 L + a2 L^2 + a3 L^3        L ~ c1 q + c2 q^2 + c3 q^3     (third order, as in section 4.1)
 
-is fitted by least squares; divided by its largest value in the reference views it gives grey levels from 0 to 1.
-The outline of an uncorrected volume is slightly off, so that the fit is done twice.
+(fitted to q, L would come out flatter than it is). Divided by its largest value in the reference views L gives grey
+levels from 0 to 1. The outline of an uncorrected volume is off, so that outline and fit are repeated until they stay.
+
+The slope counts most: as a stretched section becomes thinner, grey levels follow dL/dq, and where these fall by
+another share than lengths do the sample seems to contract, or to move along the beam.
 """
 
 from __future__ import annotations
@@ -31,6 +35,13 @@ Image = NDArray[np.float32]
 SLAB_VOXELS = 4
 """Height of the hull's slabs in voxels of the coarse volume."""
 _FIT_VIEWS = 24
+_DEEP = 0.25
+"""Share of the longest path from which on rays count: edges, where a pixel is only partly covered, say little."""
+_CURVE_POINTS = 200
+_ROUNDS = 8
+"""Times that outline and polynomial are found in turn, at most."""
+_SETTLED = 5e-4
+"""Change of the path of half the largest attenuation, over that of the largest, that ends the rounds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +73,14 @@ def find_outline(
         _check_rising(polynomial, max(float(np.percentile(image, 99.9)) for image in views))
     grid = _whole_grid(geometry)
     fitted = polynomial or (1.0, 0.0, 0.0)
-    for _ in range(1 if polynomial else 2):
+    deepest = max(float(image.max()) for image in views)
+    for _ in range(_ROUNDS):
         inside = _inside(views, geometry, angle_rad, grid, fitted, progress)
-        if polynomial is None:
-            fitted = _fit(views, geometry, angle_rad, grid, inside)
+        if polynomial is not None:
+            break
+        before, fitted = fitted, _fit(views, geometry, angle_rad, grid, inside)
+        if abs(_half(deepest, fitted) - _half(deepest, before)) < _SETTLED:
+            break
     largest = max(float(_apply(image, fitted).max()) for image in views)
     hull = hull_of(inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
     c1, c2, c3 = (c / largest for c in fitted)
@@ -75,6 +90,12 @@ def find_outline(
 def _apply(attenuation: Image, polynomial: tuple[float, float, float]) -> Image:
     c1, c2, c3 = (np.float32(c) for c in polynomial)
     return np.asarray(attenuation * (c1 + attenuation * (c2 + attenuation * c3)), dtype=np.float32)
+
+
+def _half(attenuation: float, polynomial: tuple[float, float, float]) -> float:
+    """Return the path of half an attenuation over that of the whole: the curve's bend, whatever its scale."""
+    half, whole = _apply(np.array([attenuation / 2, attenuation], dtype=np.float32), polynomial)
+    return float(half / whole)
 
 
 def _check_rising(polynomial: tuple[float, float, float], most: float) -> None:
@@ -147,7 +168,7 @@ def _sample_level(values: NDArray[np.float32]) -> float:
 def _fit(
     views: list[Image], geometry: ConeBeam, angle_rad: Floats, grid: Grid, inside: NDArray[np.bool_]
 ) -> tuple[float, float, float]:
-    """Fit path length against attenuation over the middle rows of some views, mm."""
+    """Return path length, mm, as a polynomial of attenuation, from the middle rows of some views."""
     hull = hull_of(inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
     volume = Volume(values=_framed_copy(inside), grid=grid, hull=hull)
     middle = slice(geometry.rows // 5, geometry.rows - geometry.rows // 5)
@@ -159,10 +180,11 @@ def _fit(
         lengths.append(length.ravel())
         attenuations.append(views[i][middle].ravel())
     length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)
-    # edges, where a pixel is only partly covered, say little about the beam
-    deep = length > 0.25 * length.max()
-    q, length = q[deep], length[deep]
-    c1, c2, c3 = np.linalg.lstsq(np.stack([q, q**2, q**3], axis=1), length, rcond=None)[0]
+    powers, longest = np.arange(1, 4), length.max()
+    deep = length > _DEEP * longest
+    a = np.linalg.lstsq(length[deep, None] ** powers, q[deep], rcond=None)[0]
+    curve = np.linspace(_DEEP * longest, longest, _CURVE_POINTS)
+    c1, c2, c3 = np.linalg.lstsq((curve[:, None] ** powers @ a)[:, None] ** powers, curve, rcond=None)[0]
     return float(c1), float(c2), float(c3)
 
 

@@ -37,9 +37,10 @@ from pdvc.coherent import by_block, excess
 from pdvc.equations import Equations, joined
 from pdvc.history import Angle, Polynomial, TimeFunction, time_basis
 from pdvc.noise import Propagated
-from pdvc.process import FITTED_MODES, ROUNDS, Deviations, Process, Seen, Smoothed, StateSpace
+from pdvc.process import FITTED_MODES, ROUNDS, Process, Seen, Smoothed
 from pdvc.projection import BlockVectors
 from pdvc.solution import SHORTER, Known, Problem, Solution, Solver
+from pdvc.state_space import Deviations, StateSpace
 from pdvc.verdict import Stop, listed
 
 Floats = NDArray[np.float64]

@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 from scipy import optimize, stats
 
 from pdvc import process as room
-from pdvc.process import LONGEST_GAP, Deviations, Process, Seen, Smoothed, StateSpace
+from pdvc.filtering import Filter, filtered
+from pdvc.process import Process, Seen, Smoothed
 from pdvc.sections import CONTRACTION, RIGID, TRANSLATION_X, TRANSLATION_Z, SectionBasis
+from pdvc.state_space import LONGEST_GAP, Deviations, StateSpace
 from tests.laws import law
 
 HEIGHT = np.array([-1.1, -0.4, 0.5, 1.2])
@@ -252,6 +254,45 @@ def test_the_response_to_errors_of_the_data_is_what_they_change(seed, steps, sec
         wrong = replace(one, seen=replace(one.seen, data=one.seen.data + errors[..., draw]))
         change = solved(wrong)[0] - mean
         np.testing.assert_allclose(found[..., draw], change, atol=1e-7 * np.abs(mean).max())
+
+
+@law(20)
+@given(seeds, lengths, motions, st.integers(0, 2))
+def test_the_filter_at_each_step_is_the_smoother_of_a_test_that_ended_there(seed, steps, section_motions, trend):
+    one = case(seed, steps, section_motions, trend=trend, even=True)
+    mean, covariance = filtered(one.process, one.deviations)
+    for last in range(1, steps + 1):
+        so_far = ended(one, last)
+        expected, spread, _ = solved(so_far)
+        np.testing.assert_allclose(mean[last - 1], expected[-1], atol=1e-6 * np.abs(expected).max())
+        np.testing.assert_allclose(covariance[last - 1], spread[-1], atol=1e-6 * np.abs(spread).max())
+
+
+def ended(one: Case, steps: int) -> Case:
+    """Return a case of its first steps alone."""
+    given, bends = one.deviations, max(steps - 2, 0)
+    return replace(
+        one,
+        time_s=one.time_s[:steps],
+        trend=one.trend[:, :steps],
+        seen=Seen(design=one.seen.design[:steps], data=one.seen.data[:steps]),
+        deviations=replace(
+            given,
+            rigid_scale=given.rigid_scale[:bends],
+            own_scale=given.own_scale[:bends],
+            misfit=given.misfit[:steps],
+            apparent_scale=given.apparent_scale[:steps],
+        ),
+    )
+
+
+def test_a_filter_takes_no_more_steps_than_there_are():
+    one = case(0, 2)
+    told, known = one.process.told(one.deviations), Filter(one.space, one.deviations)
+    for t in range(2):
+        known.add(told.information[t], told.vector[t])
+    with pytest.raises(ValueError, match="step: expected at most 2"):
+        known.add(told.information[0], told.vector[0])
 
 
 class Caught(Exception):

@@ -13,10 +13,10 @@ from pdvc.equations import Equations, joined
 from pdvc.experiment import Series
 from pdvc.noise import ImageNoise, Noise, Propagated, propagate
 from pdvc.prior import Prior
-from pdvc.process import StateSpace
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
 from pdvc.smoother import Smoother, _in_words, seen
 from pdvc.solution import Problem
+from pdvc.state_space import StateSpace
 from pdvc.systematic import Systematic
 from pdvc.verdict import Stop
 from tests import small_case
