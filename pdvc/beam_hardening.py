@@ -36,7 +36,10 @@ SLAB_VOXELS = 4
 """Height of the hull's slabs in voxels of the coarse volume."""
 _FIT_VIEWS = 24
 _DEEP = 0.25
-"""Share of the longest path from which on rays count: edges, where a pixel is only partly covered, say little."""
+"""Share of the longest path from which on rays count."""
+_ALIKE = 0.8
+"""Least share of a path that its neighbours in the row have to have: a pixel that an edge covers in part shows less
+than the attenuation of its mean path."""
 _CURVE_POINTS = 200
 _ROUNDS = 8
 """Times that outline and polynomial are found in turn, at most."""
@@ -176,9 +179,11 @@ def _fit(
     lengths, attenuations = [], []
     for i in np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int)):
         rays = ray_vectors(window, angle_rad[i]).stacked()
-        length = project_at_rest(volume, rays, (window.rows, window.columns))
-        lengths.append(length.ravel())
-        attenuations.append(views[i][middle].ravel())
+        length = project_at_rest(volume, rays, (window.rows, window.columns))[0]
+        shortest, longest = ndimage.minimum_filter1d(length, 3), ndimage.maximum_filter1d(length, 3)
+        even = shortest >= _ALIKE * longest
+        lengths.append(length[even])
+        attenuations.append(views[i][middle][even])
     length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)
     powers, longest = np.arange(1, 4), length.max()
     deep = length > _DEEP * longest
