@@ -244,7 +244,7 @@ def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "runs"), [("noise", 80), ("views-per-turn", 60), ("sections", 60), ("coverage", 60)]
+    ("name", "runs"), [("noise", 80), ("views-per-turn", 60), ("sections", 60), ("coverage", 60), ("resolution", 90)]
 )
 def test_builtin_studies_are_valid_and_printed_as_they_are_written(name, runs):
     assert name in builtin_studies()

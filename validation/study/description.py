@@ -33,7 +33,7 @@ from pdvc.options import PROTOCOLS, MeasureOptions, check_discarded
 from pdvc.settings import Settings, SettingsError
 from simulator.scenario import Scenario, load_scenario
 from validation.batch.engine import Scalar
-from validation.batch.trial import BOUND_COLUMNS, Trial, score_columns
+from validation.batch.trial import BOUND_COLUMNS, RECOVERY_COLUMNS, Trial, score_columns
 
 _TAKEN = ("seed", "repetition", "status", "reason", "seconds", "version", "key", "runs", "failed")
 
@@ -138,7 +138,7 @@ class Study(Settings):
         lengths = {len(factor.values) for factor in self.factor}
         if self.design == "list" and len(lengths) > 1:
             raise ValueError(f"as many values of each factor in a list, got {sorted(lengths)}")
-        taken = [*_TAKEN, *score_columns(), *BOUND_COLUMNS.values()]
+        taken = [*_TAKEN, *score_columns(), *BOUND_COLUMNS.values(), *RECOVERY_COLUMNS]
         for factor in self.factor:
             if factor.column in taken:
                 raise ValueError(f"another name for factor {factor.column}: a column of the table has it already")
