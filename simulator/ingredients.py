@@ -8,8 +8,8 @@ They are carried out in this order, from the material outwards:
 3. ``backlash``: it moves between reference scan and test, and again when the stroke starts;
 4. ``wobble``: the stage turns about another axis than during the reference scan. Fixed in the lab, this is a
    sine and a cosine of the stage angle in the sample frame;
-5. only where a scenario asks for them: ``creep``, with the deformations, and ``wander``, a random motion of the whole.
-   No time function follows them.
+5. only where a scenario asks for them: ``creep`` and ``ripple``, with the deformations, and ``wander``, a random
+   motion of the whole. No time function follows creep and wandering; a ripple asks what the sections follow.
 
 One more is one more record here, a `Deforming` or a `Moving` one, and its field in `MotionOptions`.
 
@@ -40,6 +40,8 @@ Vector = tuple[float, float, float]
 Poisson = Annotated[float, Field(ge=0, le=0.5)]
 
 ZERO: Vector = (0.0, 0.0, 0.0)
+HEIGHTS_A_WAVE = 8
+"""Fewest heights in a wavelength: splines between them then miss the strain by half a per cent of its amplitude."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,6 +229,37 @@ class Creep(Deforming):
         return Deformation(strain=strain, stretch=1 / np.sqrt(1 + strain))
 
 
+class Ripple(Deforming):
+    """A strain sinusoidal in height, at constant volume, in proportion to the force gained.
+
+        eps(Z, t) = eps_a sin(2 pi Z / lambda + phi) (F(t) - F(0)) / (F(T) - F(0)),      s = (1 + eps)^(-1/2)
+
+    with the height Z of the material, mm, zero in the middle of the ligament, the last step T, and the transverse
+    stretch s. The amplitude is the same at all heights, whatever the section: it asks how fine a strain is recovered.
+    """
+
+    strain: Annotated[float, Field(ge=0, lt=1)] = 0.02
+    """amplitude eps_a at the last step, without unit"""
+    wavelength_mm: Annotated[float, Field(gt=0)] = 2.0
+    """wavelength lambda along z, mm"""
+    phase_deg: float = 0.0
+    """phase phi in the middle of the ligament, degrees; 0: a sine, 90: a cosine"""
+
+    def deformation(self, drive: Drive) -> Deformation:
+        """Return the strain and the contraction; raises ValueError where the heights are too few for the wave."""
+        height = drive.history.height_mm
+        shortest = HEIGHTS_A_WAVE * float(np.diff(height).max())
+        # a hair of room: a wavelength of just so many heights is not refused by rounding
+        if self.wavelength_mm < (1 - 1e-9) * shortest:
+            raise ValueError(
+                f"motion.ripple.wavelength_mm: expected at least {shortest:.4g} mm, {HEIGHTS_A_WAVE} of the heights "
+                f"at which strains are given, got {self.wavelength_mm} mm"
+            )
+        wave = np.sin(2 * np.pi * height / self.wavelength_mm + np.deg2rad(self.phase_deg))
+        strain = self.strain * drive.history.load_fraction[:, None] * wave
+        return Deformation(strain=strain, stretch=1 / np.sqrt(1 + strain))
+
+
 class Wander(Moving):
     """A random motion of the sample as a whole, which no time function describes: drift, slow wandering, and slips."""
 
@@ -297,6 +330,8 @@ class MotionOptions(Settings):
     """another axis of rotation than in the reference scan"""
     creep: Creep = Creep()
     """stretch that goes on with the logarithm of time"""
+    ripple: Ripple = Ripple()
+    """strain sinusoidal in height"""
     wander: Wander = Wander()
     """random motion of the sample as a whole"""
 

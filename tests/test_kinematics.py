@@ -7,7 +7,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from simulator.ingredients import Bending, Compliance, Creep, Drive, MotionOptions, Moving, Torsion, Wander, Wobble
+from simulator.ingredients import (
+    Bending,
+    Compliance,
+    Creep,
+    Drive,
+    MotionOptions,
+    Moving,
+    Ripple,
+    Torsion,
+    Wander,
+    Wobble,
+)
 from simulator.kinematics import BeamMotion, Composition, MotionError, RigidMotion, SectionMotion, rotation_matrix
 from simulator.loading import Loading, load_history
 from simulator.solver_space import into_sections, time_functions
@@ -206,6 +217,41 @@ def test_creep_is_a_logarithm_of_time_and_keeps_the_volume():
     since = HISTORY.time_s - HISTORY.time_s[50]
     assert strain(80) / strain(126) == pytest.approx(np.log1p(since[80] / 10) / np.log1p(since[126] / 10), rel=1e-4)
     np.testing.assert_allclose(motion.stretch[126, waist] ** 2 * (1 + 3e-3), 1, rtol=1e-9)
+
+
+@FEW
+@given(st.floats(0.4, 9.0), st.floats(-360.0, 360.0), st.floats(0.0, 0.1), st.integers(0, 126))
+def test_a_ripple_is_a_sine_of_the_height_follows_the_force_and_keeps_the_volume(wavelength, phase, strain, step):
+    ripple = Ripple(strain=strain, wavelength_mm=wavelength, phase_deg=phase)
+    motion = paper_motion(ingredients=("ripple",), ripple=ripple)
+    points = material_points()
+    points = points[np.abs(points[:, 2]) < 6]
+    share = (HISTORY.force_N[step] - 250) / (HISTORY.force_N[126] - 250)
+    due = strain * share * np.sin(2 * np.pi * points[:, 2] / wavelength + np.deg2rad(phase))
+    # cubic splines between n heights a wavelength: an error as n^-3, 0.5 % of the amplitude at n = 8
+    near = 0.006 * strain * min(1.0, (0.4 / wavelength) ** 3) + 1e-9
+    gradient = motion.gradient(points, step)
+    np.testing.assert_allclose(gradient[:, 2, 2] - 1, due, atol=near, rtol=0)
+    np.testing.assert_allclose(gradient[:, 0, 0], 1 / np.sqrt(1 + due), atol=near, rtol=0)
+    np.testing.assert_allclose(gradient[:, 1, 1], gradient[:, 0, 0], rtol=0)
+    np.testing.assert_allclose(np.linalg.det(gradient), 1, atol=2 * near, rtol=0)
+    check_gradient(motion, points, step)
+    # u_z is the integral of the strain from the middle of the ligament
+    moved = motion.forward(np.column_stack([0 * due, 0 * due, points[:, 2]]), step)
+    k, phi = 2 * np.pi / wavelength, np.deg2rad(phase)
+    shift = strain * share * (np.cos(phi) - np.cos(k * points[:, 2] + phi)) / k
+    np.testing.assert_allclose(moved - points * [0, 0, 1], np.outer(shift, [0, 0, 1]), atol=near, rtol=0)
+
+
+@law(30)
+@given(st.floats(0.01, 1.0))
+def test_a_ripple_finer_than_the_heights_is_refused(wavelength):
+    ripple = Ripple(wavelength_mm=wavelength)
+    if wavelength >= 0.4:  # eight heights, 0.05 mm apart
+        ripple.deformation(DRIVE)
+    else:
+        with pytest.raises(ValueError, match=r"motion\.ripple\.wavelength_mm: expected at least 0\.4 mm"):
+            ripple.deformation(DRIVE)
 
 
 def test_wandering_has_the_size_and_the_slowness_that_are_asked_for():

@@ -55,6 +55,11 @@ def test_quick_is_the_paper_four_times_coarser():
         ("[loading]\nforce = 3", r"loading\.force: unknown key"),
         ('seed = "a"', r"seed: expected a valid integer.*, given 'a'"),
         ("[motion]\nsections = 1", r"motion\.sections: expected 0, or at least 2 sections, given 1"),
+        (
+            "[motion.ripple]\nwavelength_mm = 0.0",
+            r"motion\.ripple\.wavelength_mm: expected greater than 0, given 0\.0",
+        ),
+        ("[motion.ripple]\nstrain = 1.0", r"motion\.ripple\.strain: expected less than 1, given 1\.0"),
         ('[motion]\ningredients = ["swim"]', r"motion\.ingredients\.0: expected 'tension', .*, given 'swim'"),
         ("[specimen]\nlength_mm = 5.0", r"expected specimen\.length_mm of at least 10\.\d+ mm"),
         ("discarded_rows = 477", r"discarded_rows below half of the 954 detector rows, got 477"),

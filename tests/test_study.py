@@ -114,6 +114,30 @@ class TestDesigns:
         assert (first.scenario.acquisition.test_steps, last.scenario.acquisition.test_steps) == (16, 24)
         assert (first.options.time[0].kind, last.options.time[0].kind) == ("force", "polynomial")
 
+    def test_a_table_changes_the_keys_that_it_names_and_leaves_the_others(self, tmp_path):
+        protocols = """
+            [[factor]]
+            key = "options"
+            name = "method"
+            names = ["base", "weighted"]
+            [[factor.values]]
+            [[factor.values]]
+            sections = 4
+            weighting = "noise"
+            [[factor]]
+            key = "options.sections"
+            values = [5]
+        """
+        base, _, other, _ = trials(tmp_path, BASE + protocols)
+        assert (base.factors, other.factors) == (
+            {"method": "base", "sections": 5},
+            {"method": "weighted", "sections": 5},
+        )
+        assert base.options.weighting == "uniform"
+        # the later factor has the last word, and what the table does not name is as in the base
+        assert other.options == base.options.model_copy(update={"weighting": "noise"})
+        assert other.options.rigid[0].solver.kind == "gauss-newton"
+
     def test_values_of_several_types_become_text_in_the_table(self, tmp_path):
         factor = '[[factor]]\nkey = "options.beam_hardening"\nvalues = ["fit", "none", [0.9, 0.1, 0.0]]\n'
         found = trials(tmp_path, BASE + factor)
@@ -176,6 +200,9 @@ MISTAKES = {
     BASE + FACTOR + 'values = [1]\nname = "strain_rms"': "expected another name for factor strain_rms",
     BASE + FACTOR + 'values = [1, 2]\nnames = ["one"]': "as many names as values, 2, got 1",
     BASE + '[[factor]]\nkey = ["options.sections", "options.weighting"]\nvalues = [[1]]': "a list of 2, one for",
+    BASE + '[[factor]]\nkey = "options"\n[[factor.values]]\nsection = 3': (
+        "study.toml: factor.options.section: unknown key; did you mean 'sections'?"
+    ),
     BASE + '[[factor]]\nkey = "options.discard_rows"\nvalues = [30]': "options.discard_rows = 30: options:",
     'design = "list"\n' + BASE + FACTORS.replace("[3, 5]", "[3]"): "as many values of each factor in a list",
     'design = "latin-hypercube"\n' + BASE + FACTORS: "expected samples for design = 'latin-hypercube'",
@@ -216,7 +243,9 @@ def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
     assert "did you mean 'noise'?" in only_line(result)
 
 
-@pytest.mark.parametrize(("name", "runs"), [("noise", 80), ("views-per-turn", 60), ("sections", 60), ("coverage", 60)])
+@pytest.mark.parametrize(
+    ("name", "runs"), [("noise", 80), ("views-per-turn", 60), ("sections", 60), ("coverage", 60), ("resolution", 90)]
+)
 def test_builtin_studies_are_valid_and_printed_as_they_are_written(name, runs):
     assert name in builtin_studies()
     path = study_file(name)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.tiny_scenarios import trial
 from validation.batch import trial as room
-from validation.batch.trial import BOUND_COLUMNS, Volumes, clean_parts, score_columns
+from validation.batch.trial import BOUND_COLUMNS, RECOVERY_COLUMNS, Volumes, clean_parts, score_columns
 
 
 def without_times(scores):
@@ -40,7 +40,7 @@ def test_sharing_changes_nothing(tmp_path):
 
 
 def self_consistent(result):
-    columns = {**score_columns(), **dict.fromkeys(BOUND_COLUMNS.values(), float)}
+    columns = {**score_columns(), **dict.fromkeys((*BOUND_COLUMNS.values(), *RECOVERY_COLUMNS), float)}
     assert set(result.scores) == set(columns)
     for name, kind in columns.items():
         assert isinstance(result.scores[name], kind), name

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from simulator.scenario import Scenario
     from validation.study.coverage import Honesty
     from validation.study.description import Study
+    from validation.study.resolution import Resolution
 
 INTERRUPTED = 130
 WRONG_INPUT = 2
@@ -247,6 +248,28 @@ def honesty_table(study: Study, found: Honesty) -> Table:
                 f"{one.found.value:.0%} ({one.binomial[0]:.0%} to {one.binomial[1]:.0%})".replace("%", "")
                 for one in covered
             ),
+        )
+    return table
+
+
+def resolved_table(study: Study, found: Sequence[Resolution]) -> Table:
+    """Return what each method of a study resolves, as a table of one screen."""
+    title = f"{study.name}: d, beyond which strains are recovered to a tenth; their noise s"
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for name in found[0].combination:
+        table.add_column(name.replace("_", " "), no_wrap=True)
+    for name in ("d, mm", "at best, mm", "s, 1e-3", "s d, um", "s d², um mm"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for each in found:
+        d = each.resolution_mm
+        interval = f" ({d.low:.2f} to {d.high:.2f})" if math.isfinite(d.low) else ""
+        table.add_row(
+            *(str(value) for value in each.combination.values()),
+            each.outside or f"{d.value:.2f}{interval}",
+            each.recoverable_outside or f"{each.recoverable_mm:.2f}",
+            f"{1e3 * each.sigma:.2f}",
+            f"{each.indicator_um:.2f}",
+            f"{each.strain_indicator_um_mm:.2f}",
         )
     return table
 

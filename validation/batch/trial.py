@@ -46,6 +46,7 @@ from simulator.truth import Truth, read_truth
 from validation.batch.engine import Part, Result, Scalar
 from validation.scoring.bound import kept_bound
 from validation.scoring.centre_line import centre_line
+from validation.scoring.resolution import Recovery, recovery, strain_profile
 from validation.scoring.scores import Scores, point_errors, score
 
 CLEAN = "clean"
@@ -54,6 +55,10 @@ BOUND_COLUMNS = {
     for each in fields(Quantities)
 }
 """The column of each part of the bound."""
+RECOVERY_COLUMNS = tuple(each.name for each in fields(Recovery))
+"""Of the amplitude of a strain sinusoidal in height; NaN where a scenario has none."""
+PROFILE = "profile"
+"""Array of a run with such a strain: the measured strain (step, interval) of `validation.scoring.resolution`."""
 _NOT_SCORES = ("scenario", "peak_memory_gib")
 """Fields of `Scores` that a row has elsewhere, or that belong to a process which does many runs."""
 
@@ -87,7 +92,7 @@ class Trial:
     @property
     def score_columns(self) -> Mapping[str, type]:
         """Return names and types of what `carry_out` finds."""
-        return {**score_columns(), **dict.fromkeys(BOUND_COLUMNS.values(), float)}
+        return {**score_columns(), **dict.fromkeys((*BOUND_COLUMNS.values(), *RECOVERY_COLUMNS), float)}
 
     def parts(self) -> tuple[Part, ...]:
         """Return what other trials may share: clean stacks, volumes, and the bound of the scenario."""
@@ -102,7 +107,7 @@ class Trial:
         with simulated(self.scenario, shared) as (experiment, truth, simulate_s):
             work = shared / Volumes(self.scenario, self.options).name
             measurement = measure(experiment, self.options, work=work)
-            result = result_of(measurement, truth, simulate_s=simulate_s)
+            result = with_wave(result_of(measurement, truth, simulate_s=simulate_s), measurement, truth, self.scenario)
         least = asdict(LeastError(self.scenario, self.options).read(shared))
         return replace(result, scores={**result.scores, **{BOUND_COLUMNS[name]: least[name] for name in least}})
 
@@ -221,6 +226,15 @@ def result_of(measurement: Measurement, truth: Truth, *, simulate_s: float = mat
     """Score a measurement: one row of scores, and the errors themselves for means over repetitions."""
     scores = score(measurement, truth, simulate_s=simulate_s)
     return Result(scores=flattened(scores), arrays=compact_errors(measurement, truth))
+
+
+def with_wave(result: Result, measurement: Measurement, truth: Truth, scenario: Scenario) -> Result:
+    """Return the result with what was recovered of a scenario's `ripple`, and the profile that tells the noise."""
+    if "ripple" not in scenario.motion.ingredients:
+        return replace(result, scores={**result.scores, **dict.fromkeys(RECOVERY_COLUMNS, math.nan)})
+    found = recovery(measurement, truth, scenario.motion.ripple.wavelength_mm)
+    profile = strain_profile(measurement, truth).measured.astype(np.float32)
+    return Result(scores={**result.scores, **asdict(found)}, arrays={**result.arrays, PROFILE: profile})
 
 
 def compact_errors(measurement: Measurement, truth: Truth) -> dict[str, NDArray[np.float32]]:

@@ -125,10 +125,14 @@ def study(
             )
     from rich.console import Console
 
-    from validation.console import honesty_table, study_summary
+    from validation.console import honesty_table, resolved_table, study_summary
     from validation.study.coverage import honesty
+    from validation.study.resolution import resolutions
 
-    if chosen.pooled:
+    resolved = resolutions(chosen, table, out)
+    if resolved:
+        Console().print(resolved_table(chosen, resolved))
+    elif chosen.pooled:
         for found in honesty(chosen, table):
             Console().print(honesty_table(chosen, found))
     else:

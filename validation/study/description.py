@@ -33,7 +33,7 @@ from pdvc.options import PROTOCOLS, MeasureOptions, check_discarded
 from pdvc.settings import Settings, SettingsError
 from simulator.scenario import Scenario, load_scenario
 from validation.batch.engine import Scalar
-from validation.batch.trial import BOUND_COLUMNS, Trial, score_columns
+from validation.batch.trial import BOUND_COLUMNS, RECOVERY_COLUMNS, Trial, score_columns
 
 _TAKEN = ("seed", "repetition", "status", "reason", "seconds", "version", "key", "runs", "failed")
 
@@ -44,7 +44,7 @@ class Factor(Settings):
     key: str | tuple[str, ...]
     """path of what changes, as scenario.detector.frames or options.sections; a list of paths changes together"""
     values: tuple[Any, ...] = ()
-    """values to take; with several keys, a list of values for each"""
+    """values to take; with several keys, a list of values for each; a table changes the keys that it names"""
     low: float | None = None
     """for a Latin hypercube, instead of values: lower end of the range"""
     high: float | None = None
@@ -138,7 +138,7 @@ class Study(Settings):
         lengths = {len(factor.values) for factor in self.factor}
         if self.design == "list" and len(lengths) > 1:
             raise ValueError(f"as many values of each factor in a list, got {sorted(lengths)}")
-        taken = [*_TAKEN, *score_columns(), *BOUND_COLUMNS.values()]
+        taken = [*_TAKEN, *score_columns(), *BOUND_COLUMNS.values(), *RECOVERY_COLUMNS]
         for factor in self.factor:
             if factor.column in taken:
                 raise ValueError(f"another name for factor {factor.column}: a column of the table has it already")
@@ -230,7 +230,7 @@ def _at(factor: Factor, share: float, base: dict[str, Any]) -> Combination:
         value = float(np.exp(np.log(factor.low) + share * np.log(factor.high / factor.low)))
     else:
         value = factor.low + share * (factor.high - factor.low)
-    usual = _look_up(base, factor.keys[0])
+    usual = _look_up(base, factor.keys[0].split("."))
     # a number that is left open may be a whole one: the limits tell
     whole = type(usual) is int or (usual is None and factor.low == int(factor.low) and factor.high == int(factor.high))
     said = round(value) if whole else value
@@ -289,9 +289,9 @@ def _paths(values: dict[str, Any], above: str = "") -> Iterator[str]:
             yield from _paths(value, f"{above}{name}.")
 
 
-def _look_up(base: dict[str, Any], key: str) -> Any:
+def _look_up(base: dict[str, Any], names: Sequence[str]) -> Any:
     part: Any = base
-    for name in key.split("."):
+    for name in names:
         part = part[name]
     return part
 
@@ -299,8 +299,8 @@ def _look_up(base: dict[str, Any], key: str) -> Any:
 def _parsed(base: dict[str, Any], combination: Combination, path: Path) -> tuple[Scenario, MeasureOptions]:
     values = copy.deepcopy(base)
     for key, value in combination.changes:
-        above, _, last = key.rpartition(".")
-        _look_up(values, above)[last] = value
+        *above, last = key.split(".")
+        _merge(_look_up(values, above), {last: value}, f"{path}: factor", tuple(above))
     said = ", ".join(f"{key} = {value!r}" for key, value in combination.changes)
     where = f"{path}: {said}" if said else str(path)
     scenario = Scenario.parse(values["scenario"], where=f"{where}: scenario")

@@ -12,9 +12,11 @@ import pandas as pd
 from validation.batch.doubts import doubted
 from validation.batch.engine import FAILED
 from validation.report.template import template
+from validation.scoring.bootstrap import Estimate
 from validation.study.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
 from validation.study.description import Study
-from validation.study.figures import study_pictures
+from validation.study.figures import resolution_picture, study_pictures
+from validation.study.resolution import Resolution, resolution_table, resolutions
 from validation.study.summary import PARTS, QUANTITIES, mean_scores, summarise
 
 HEADINGS = {
@@ -35,20 +37,25 @@ def write_study_report(
     summary = summarise(study, table, folder)
     scores = mean_scores(study, table)
     shown = honesty(study, table)
-    for name, frame in (("summary", summary), ("scores", scores), ("coverage", coverage_table(shown))):
+    resolved = resolutions(study, table, folder)
+    frames = {"summary": summary, "scores": scores, "coverage": coverage_table(shown)}
+    if resolved:
+        frames["resolution"] = resolution_table(resolved)
+    for name, frame in frames.items():
         partial = folder / f"{name}.csv.partial"
         frame.to_csv(partial, index=False)
         partial.replace(folder / f"{name}.csv")
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = []
-    for picture in study_pictures(study, summary):
+    drawn = [*([resolution_picture(resolved)] if resolved else []), *study_pictures(study, summary)]
+    for picture in drawn:
         path = folder / "figures" / f"{picture.name}.png"
         picture.figure.savefig(path, dpi=120)
         data = base64.b64encode(path.read_bytes()).decode("ascii")
         pictures.append({"name": picture.name, "caption": picture.caption, "data": data})
     page = folder / "study.html"
     partial = page.with_name("study.html.partial")
-    partial.write_text(_page(study, text, table, summary, scores, shown, pictures, where), encoding="utf-8")
+    partial.write_text(_page(study, text, table, summary, scores, shown, resolved, pictures, where), encoding="utf-8")
     partial.replace(page)
     return page, summary
 
@@ -60,6 +67,7 @@ def _page(
     summary: pd.DataFrame,
     scores: pd.DataFrame,
     shown: list[Honesty],
+    resolved: list[Resolution],
     pictures: list[dict[str, str]],
     where: str,
 ) -> str:
@@ -89,6 +97,9 @@ def _page(
             }
             for each in shown
         ],
+        wavelengths=[f"{length:g}" for length in resolved[0].wavelength_mm] if resolved else [],
+        resolved=[_resolved(each) for each in resolved],
+        resolved_by=[name.replace("_", " ") for name in resolved[0].combination] if resolved else [],
         scores_columns=list(scores.columns),
         scores=[[_cell(value) for value in row] for row in scores.itertuples(index=False)],
         pictures=pictures,
@@ -112,6 +123,24 @@ def _covered(found: Honesty) -> list[list[str]]:
     return lines
 
 
+def _resolved(found: Resolution) -> list[str]:
+    """Return the cells of one method: what it recovers at each wavelength, its resolutions and the indicators."""
+    return [
+        *(_cell(value) for value in found.combination.values()),
+        *(_interval(share) for share in found.recovered),
+        found.outside or _interval(found.resolution_mm),
+        found.recoverable_outside or _cell(found.recoverable_mm),
+        _cell(1e3 * found.sigma),
+        _cell(found.indicator_um),
+        _cell(found.strain_indicator_um_mm),
+    ]
+
+
+def _interval(estimate: Estimate) -> str:
+    value = _cell(estimate.value)
+    return f"{value} ({_cell(estimate.low)} to {_cell(estimate.high)})" if np.isfinite(estimate.low) else value
+
+
 def _summary_row(row: pd.Series, factors: list[str]) -> dict[str, list[str]]:
     """Return the cells of one combination: its factors and counts, then for each quantity the three parts."""
     cells = []
@@ -125,7 +154,7 @@ def _summary_row(row: pd.Series, factors: list[str]) -> dict[str, list[str]]:
 
 def _with_interval(row: pd.Series, name: str) -> str:
     value, low, high = (row[name + end] for end in ("", "_low", "_high"))
-    return _cell(value) + (f" ({_cell(low)} to {_cell(high)})" if np.isfinite(low) else "")
+    return _interval(Estimate(value=value, low=low, high=high))
 
 
 def _cell(value: object) -> str:
