@@ -61,6 +61,22 @@ def test_the_fitted_polynomial_makes_grey_levels_proportional_to_length(bar):
     assert np.abs(raw - slope * length[deep]).max() / (slope * length.max()) > 0.04
 
 
+def slopes(polynomial, longest):
+    """Return d ln G / d ln L at paths from half of the longest one to nine tenths."""
+    length = np.linspace(0.3, 1, 701) * longest
+    slope = np.gradient(np.log(levels(attenuation(length), polynomial)), np.log(length))
+    return slope[200:600]
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.08])
+def test_grey_levels_change_with_length_in_proportion_whatever_nodules_and_photons_scatter(bar, scatter):
+    # what a sample that becomes thinner is seen by; paths fitted to attenuations, which scatter, would rise too little
+    length, views, _ = bar
+    scattered = views * (1 + scatter * np.random.default_rng(0).standard_normal(views.shape)).astype(np.float32)
+    found = find_outline(lambda i: scattered[i], SCANNER, ANGLES, None)
+    assert np.abs(slopes(found.polynomial, length.max()) - 1).max() < 0.04
+
+
 def test_the_largest_grey_level_is_one(bar):
     _, views, outline = bar
     assert levels(views, outline.polynomial).max() == pytest.approx(1, abs=1e-5)
