@@ -15,6 +15,7 @@ from validation.report.template import template
 from validation.study.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
 from validation.study.description import Study
 from validation.study.figures import study_pictures
+from validation.study.score_figures import score_pictures
 from validation.study.summary import PARTS, QUANTITIES, mean_scores, summarise
 
 HEADINGS = {
@@ -41,7 +42,7 @@ def write_study_report(
         partial.replace(folder / f"{name}.csv")
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = []
-    for picture in study_pictures(study, summary):
+    for picture in (*score_pictures(study, scores), *study_pictures(study, summary)):
         path = folder / "figures" / f"{picture.name}.png"
         picture.figure.savefig(path, dpi=120)
         data = base64.b64encode(path.read_bytes()).decode("ascii")
