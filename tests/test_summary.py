@@ -165,9 +165,10 @@ def test_a_score_is_drawn_against_each_factor_with_a_panel_for_each_value_of_the
     assert [ax.get_title() for ax in by_light] == [f"frames averaged: {number}" for number in (1, 5, 25)]
     for frames_, ax in zip((1, 5, 25), by_sections, strict=True):
         few, some = ax.get_lines()
-        assert [few.get_label(), some.get_label()] == ["light: few", "light: some"]
+        assert [few.get_label(), some.get_label()] == ["few", "some"]
         np.testing.assert_allclose(some.get_ydata(), [0.5 - frames_ / 100, 1 - frames_ / 100])
         assert few.get_linewidth() > 0
+    assert pictures[1].figure.legends[0].get_title().get_text() == "light"
     assert [label.get_text() for label in by_light[0].get_xticklabels()] == ["few", "some"]
     assert [line.get_linewidth() for line in by_light[0].get_lines()] == [0, 0]
 

@@ -48,12 +48,14 @@ def _picture(study: Study, name: str, factor: Factor, scores: pd.DataFrame) -> S
     figure = Figure(figsize=(3.4 * len(panels) + 2.2, 3.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
+    told = others[:-1] if len(others) > 1 else others
     for ax, (title, rows) in zip(axes, panels, strict=True):
-        draw_score(factor, name, list(_curves(others[:-1] if len(others) > 1 else others, rows)), ax)
+        draw_score(factor, name, list(_curves(told, rows)), ax)
         ax.set_title(title, fontsize=10)
         ax.set_xlabel(factor.axis_label)
     axes[0].set_ylabel(name.replace("_", " "))
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
+    legend = ", ".join(other.axis_label for other in told)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper", frameon=False, title=legend)
     caption = f"{name} ({'mean over the repetitions' if study.repetitions > 1 else 'one run each'})"
     caption += f" against {factor.axis_label}"
     if others:
@@ -76,4 +78,4 @@ def _curves(others: Sequence[Factor], scores: pd.DataFrame) -> Iterator[tuple[st
         yield "all combinations" if groups else "", scores
         return
     for values, rows in groups:
-        yield ", ".join(f"{o.axis_label}: {short(v)}" for o, v in zip(others, values, strict=True)), rows
+        yield ", ".join(short(value) for value in values), rows
