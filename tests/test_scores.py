@@ -133,6 +133,33 @@ def test_strain_error_of_a_known_strain_offset():
     assert result.max_strain_true == 0
 
 
+@pytest.mark.parametrize("share", [1.0, 0.25, 0.0, -0.5])
+def test_the_share_of_the_stretch_is_what_the_last_step_has_of_it_whatever_moves_as_a_whole(share):
+    strain = np.linspace(0, 0.06, records.STEPS)
+    truth, amplitude = records.stretched(strain, np.zeros((records.STEPS, 3)))
+    amplitude[:-1] = 0.0
+    amplitude[-1] *= share
+    amplitude[..., 2] += 7.0
+    assert score(records.measurement(amplitude), truth).stretch_share == pytest.approx(share)
+
+
+def test_one_section_in_a_wrong_place_is_a_wrong_strain_but_hardly_a_wrong_share():
+    truth, amplitude = records.stretched(*records.tensile_history())
+    amplitude[-1, 4, 2] += 3.0
+    result = score(records.measurement(amplitude), truth)
+    assert result.max_strain_measured - result.max_strain_true > 0.02
+    assert result.stretch_share == pytest.approx(1, abs=0.02)
+
+
+def test_the_share_is_that_of_the_last_step_measured_and_unknown_without_a_stretch():
+    truth, amplitude = records.stretched(*records.tensile_history())
+    amplitude[12] *= 0.5
+    amplitude[13:] = np.nan
+    assert score(records.measurement(amplitude), truth).stretch_share == pytest.approx(0.5)
+    truth, amplitude = records.stretched(np.zeros(records.STEPS), np.full((records.STEPS, 3), 0.1))
+    assert np.isnan(score(records.measurement(amplitude), truth).stretch_share)
+
+
 def test_levels_are_a_section_apart_on_the_axis():
     truth, amplitude = records.stretched(np.zeros(3), np.zeros((3, 3)))
     centre = centre_line(records.measurement(amplitude), truth)
@@ -162,7 +189,7 @@ def test_json_has_the_promised_keys_and_null_for_what_is_unknown():
         assert set(values[key]) == {"across_beam", "vertical", "along_beam"}
     assert values["seconds"] == {"simulate": 3.0, "reconstruct": 12.5, "measure": 60.25}
     assert values["peak_memory_gib"] is None
-    assert {"strain_rms", "max_strain_true", "max_strain_measured"} <= set(values)
+    assert {"strain_rms", "max_strain_true", "max_strain_measured", "stretch_share"} <= set(values)
 
 
 def test_truth_of_another_experiment_is_refused():

@@ -17,7 +17,7 @@ from distributed import LocalCluster
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulator.scenario import load_scenario
+from simulator.scenario import course_of, load_scenario
 from simulator.streams import stream
 from tests.command_line import only_line, pdvc_bench
 from tests.laws import law
@@ -198,6 +198,8 @@ MISTAKES = {
     BASE + FACTOR + "low = 1\nhigh = 5": "values of factor frames, as only a Latin hypercube takes low and high",
     BASE + FACTOR + "values = [1]\n" + FACTOR + "values = [2]": "expected another name for factor frames",
     BASE + FACTOR + 'values = [1]\nname = "strain_rms"': "expected another name for factor strain_rms",
+    'draw = ["strech_share"]\n' + BASE: "among the scores, got 'strech_share'; did you mean 'stretch_share'?",
+    'draw = ["verdict"]\n' + BASE: "expected draw of numbers among the scores, got 'verdict'",
     BASE + FACTOR + 'values = [1, 2]\nnames = ["one"]': "as many names as values, 2, got 1",
     BASE + '[[factor]]\nkey = ["options.sections", "options.weighting"]\nvalues = [[1]]': "a list of 2, one for",
     BASE + '[[factor]]\nkey = "options"\n[[factor.values]]\nsection = 3': (
@@ -243,9 +245,10 @@ def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
     assert "did you mean 'noise'?" in only_line(result)
 
 
-@pytest.mark.parametrize(
-    ("name", "runs"), [("noise", 80), ("views-per-turn", 60), ("sections", 60), ("coverage", 60), ("resolution", 90)]
-)
+RUNS = {"noise": 80, "views-per-turn": 60, "sections": 60, "coverage": 60, "capture": 45, "resolution": 90}
+
+
+@pytest.mark.parametrize(("name", "runs"), RUNS.items())
 def test_builtin_studies_are_valid_and_printed_as_they_are_written(name, runs):
     assert name in builtin_studies()
     path = study_file(name)
@@ -253,6 +256,16 @@ def test_builtin_studies_are_valid_and_printed_as_they_are_written(name, runs):
     assert len({trial.key for trial in found}) == len(found) == runs
     assert pdvc_bench("studies", name).stdout == path.read_text()
     assert f"{runs}" in next(line for line in pdvc_bench("studies").stdout.splitlines() if line.startswith(name))
+
+
+def test_the_extensions_of_the_capture_study_are_those_of_its_motion():
+    path = study_file("capture")
+    found = {trial.factors["extension_voxel"]: trial.scenario for trial in trials_of(Study.read(path), path)}
+    for voxels, scenario in found.items():
+        course, view = course_of(scenario), scenario.view_mm
+        low, high = course.motion.forward(np.array([[0, 0, -view], [0, 0, view]]), len(course.test_time_s) - 1)
+        extension_mm = high[2] - low[2] - 2 * view
+        assert extension_mm / scenario.geometry.cone_beam().voxel_mm == pytest.approx(voxels, rel=0.02)
 
 
 @pytest.fixture(scope="module")

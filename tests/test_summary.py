@@ -12,6 +12,7 @@ from tests.laws import law
 from validation.study.description import Study
 from validation.study.figures import study_pictures
 from validation.study.page import write_study_report
+from validation.study.score_figures import score_pictures
 from validation.study.summary import PARTS, QUANTITIES, estimates, mean_scores, summarise
 
 
@@ -148,6 +149,39 @@ def test_one_draw_of_each_combination_is_drawn_as_points_without_intervals(tmp_p
         (line,) = ax.get_lines()
         assert line.get_label() == "error, rms"
         assert not any(len(bars.get_segments()) for bars in ax.collections)
+
+
+def test_a_score_is_drawn_against_each_factor_with_a_panel_for_each_value_of_the_last_one():
+    light = {**FACTORS[0], "values": [500.0, 2000.0], "name": "light", "names": ["few", "some"]}
+    frames = {"key": "scenario.detector.frames", "values": [1, 5, 25], "label": "frames averaged"}
+    described = {"name": "x", "draw": ["stretch_share"], "factor": [light, FACTORS[1], frames]}
+    rows = [(a, b, c) for a in ("few", "some") for b in (4, 8) for c in (1, 5, 25)]
+    scores = pd.DataFrame(rows, columns=["light", "sections", "frames"])
+    scores["stretch_share"] = scores["sections"] / 8 - scores["frames"] / 100
+    pictures = score_pictures(Study.parse(described, where="made up"), scores)
+    assert [each.name.removeprefix("stretch_share_against_") for each in pictures] == ["light", "sections", "frames"]
+    by_light, by_sections, by_frames = (each.figure.axes for each in pictures)
+    assert [ax.get_title() for ax in by_frames] == ["sections: 4", "sections: 8"]
+    assert [ax.get_title() for ax in by_light] == [f"frames averaged: {number}" for number in (1, 5, 25)]
+    for frames_, ax in zip((1, 5, 25), by_sections, strict=True):
+        few, some = ax.get_lines()
+        assert [few.get_label(), some.get_label()] == ["few", "some"]
+        np.testing.assert_allclose(some.get_ydata(), [0.5 - frames_ / 100, 1 - frames_ / 100])
+        assert few.get_linewidth() > 0
+    assert pictures[1].figure.legends[0].get_title().get_text() == "light"
+    assert [label.get_text() for label in by_light[0].get_xticklabels()] == ["few", "some"]
+    assert [line.get_linewidth() for line in by_light[0].get_lines()] == [0, 0]
+
+
+def test_a_score_of_scattered_combinations_is_a_cloud_of_points():
+    sections = {"key": "options.sections", "values": [4, 8]}
+    described = {"name": "x", "draw": ["stretch_share"], "factor": [FACTORS[0], sections], "samples": 4}
+    study = Study.parse({**described, "design": "latin-hypercube"}, where="made up")
+    scores = pd.DataFrame({"photons_per_pixel": [500.0, 2000.0] * 2, "sections": [4, 4, 8, 8], "stretch_share": 0.5})
+    for picture in score_pictures(study, scores):
+        (ax,) = picture.figure.axes
+        (points,) = ax.get_lines()
+        assert (points.get_linewidth(), len(points.get_xdata())) == (0, 4)
 
 
 def test_the_page_tells_of_failed_runs_and_fetches_nothing(tmp_path):

@@ -26,10 +26,20 @@ from numpy.typing import NDArray
 
 from pdvc.deviations import beam_frame
 from pdvc.measurement import Measurement, MeasurementError
-from validation.scoring.centre_line import TruePoints, centre_line, current_positions, measured_at, nan_mean
+from validation.scoring.centre_line import (
+    CentreLine,
+    TruePoints,
+    centre_line,
+    current_positions,
+    measured_at,
+    nan_mean,
+)
 from validation.scoring.interval_calibration import IntervalCalibration, interval_calibration
 
 Floats = NDArray[np.float64]
+
+LEAST_STRETCH_VOXEL = 0.1
+"""Vertical motion against the mean, rms over the axis, below which no share of it is told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +100,8 @@ class Scores:
     """rms difference of measured and true strain on the axis, over steps and intervals between levels"""
     max_strain_true: float
     max_strain_measured: float
+    stretch_share: float
+    """share of the true stretch found at the last step; 1: all of it, NaN: there was none"""
     points_scored: int
     """material points scored in at least one step"""
     points_left_out: int
@@ -181,6 +193,7 @@ def score(
         strain_rms=float(_rms(measured - true)),
         max_strain_true=_largest(true),
         max_strain_measured=_largest(measured),
+        stretch_share=stretch_share(centre),
         points_scored=int(scored.sum()),
         points_left_out=int((~scored).sum()),
         verdict=measurement.verdict.word,
@@ -192,6 +205,22 @@ def score(
         ),
         peak_memory_gib=peak_memory_gib,
     )
+
+
+def stretch_share(centre: CentreLine) -> float:
+    """Return s of the least-squares fit u = s U + constant over the axis, at the last step that was measured.
+
+    u and U are the vertical motion, measured and true. One: the whole stretch is found, from end to end; what a few
+    heights err by hardly counts. NaN where U differs by less than `LEAST_STRETCH_VOXEL` rms from its mean.
+    """
+    assert centre.true is not None
+    measured, true = centre.measured[..., 2], centre.true[..., 2]
+    last = np.flatnonzero(np.isfinite(measured).any(axis=1))[-1:]
+    known = np.isfinite(measured[last])
+    stretch = true[last][known] - nan_mean(true[last][known])
+    if _rms(stretch) >= LEAST_STRETCH_VOXEL:
+        return float(stretch @ measured[last][known] / (stretch @ stretch))
+    return math.nan
 
 
 def mean_snr(measurement: Measurement) -> Snr:

@@ -123,6 +123,8 @@ class Study(Settings):
     """combinations of a Latin hypercube"""
     pooled: bool = False
     """whether coverage is asked of all combinations together, each one draw of what may happen"""
+    draw: tuple[str, ...] = ()
+    """scores of a single run to draw against each factor, besides the errors: columns of the table"""
     factor: tuple[Factor, ...] = ()
     """what varies; without any, the base is repeated"""
 
@@ -143,6 +145,9 @@ class Study(Settings):
             if factor.column in taken:
                 raise ValueError(f"another name for factor {factor.column}: a column of the table has it already")
             taken.append(factor.column)
+        for name in self.draw:
+            if score_columns().get(name) not in (int, float):
+                raise ValueError(f"draw of numbers among the scores, got {name!r}{_hint(name, list(score_columns()))}")
         return self
 
 

@@ -15,7 +15,17 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
-from validation.report.figures import BLUE, GREEN, GREY, ORANGE, VERMILION
+from validation.report.figures import GREY
+from validation.study.axis import (
+    COLOURS,
+    MARKERS,
+    MOST_CURVES,
+    StudyPicture,
+    categories,
+    mark_values,
+    positions,
+    short,
+)
 from validation.study.description import Factor, Study
 from validation.study.resolution import BIAS, Resolution
 from validation.study.summary import PARTS, QUANTITIES
@@ -25,20 +35,7 @@ Floats = NDArray[np.float64]
 TITLES = ("across the beam", "vertical", "along the beam", "axial strain")
 UNITS = ("voxel", "voxel", "voxel", "")
 PART_NAMES = {"error": "error, rms", "bias": "bias", "random": "random part"}
-COLOURS = ("black", BLUE, VERMILION, GREEN, ORANGE, "#CC79A7", "#56B4E9", GREY)
-"""Okabe and Ito's, in the order in which curves take them."""
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-MOST_CURVES = len(COLOURS)
 BOUND: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
-
-
-@dataclass(frozen=True, kw_only=True)
-class StudyPicture:
-    """A figure with what a reader has to know."""
-
-    name: str
-    caption: str
-    figure: Figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,15 +84,15 @@ def _picture(study: Study, factor: Factor, summary: pd.DataFrame) -> StudyPictur
 
 def draw_against(factor: Factor, curves: Sequence[Curve], quantity: str, ax: Axes, *, joined: bool = True) -> Axes:
     """Draw parts of the error in one quantity against a factor, with their intervals, and the bound if it is known."""
-    named = _categories(factor, curves)
+    named = categories(pd.concat([curve.rows[factor.column] for curve in curves]))
     one_part = len({curve.part for curve in curves}) == 1
     for k, curve in enumerate(curves):
         rows = curve.rows if named else curve.rows.sort_values(factor.column)
-        x = _positions(factor, rows[factor.column], named, (k - (len(curves) - 1) / 2) * 0.012)
+        x = positions(factor, rows[factor.column], named, (k - (len(curves) - 1) / 2) * 0.012)
         colour, marker = COLOURS[k % MOST_CURVES], MARKERS[k % MOST_CURVES]
         values = _positive(rows[f"{curve.part}_{quantity}"])
         low, high = (rows[f"{curve.part}_{quantity}_{end}"].to_numpy(dtype=float) for end in ("low", "high"))
-        width = 1.4 if joined and not named else 0
+        width = 1.4 if joined and not named and not rows[factor.column].duplicated().any() else 0
         ax.plot(x, values, color=colour, marker=marker, markersize=4.5, label=curve.name, linewidth=width)
         known = np.isfinite(values) & np.isfinite(low) & np.isfinite(high)
         floor = np.where(low > 0, low, values / 10)  # an interval down to zero runs out of a logarithmic axis
@@ -104,7 +101,8 @@ def draw_against(factor: Factor, curves: Sequence[Curve], quantity: str, ax: Axe
         if f"bound_{quantity}" in rows and curve.part in (("random", "error") if one_part else ("random",)):
             style = BOUND if joined and not named else {"linestyle": "none", "marker": "_", "markersize": 9}
             ax.plot(x, _positive(rows[f"bound_{quantity}"]), color=colour if one_part else GREY, **style)
-    _scales(factor, named, ax)
+    _logarithmic_values(ax)
+    mark_values(factor, named, ax)
     return ax
 
 
@@ -156,7 +154,7 @@ def _look(k: int) -> dict[str, Any]:
 
 
 def _called(each: Resolution) -> str:
-    return ", ".join(_short(value) for value in each.combination.values()) or "all runs"
+    return ", ".join(short(value) for value in each.combination.values()) or "all runs"
 
 
 def _against_wavelength(found: Sequence[Resolution], ax: Axes) -> Axes:
@@ -180,31 +178,13 @@ def _by_others(summary: pd.DataFrame, others: Sequence[Factor], part: str) -> li
         Curve(
             rows=rows,
             part=part,
-            name=", ".join(f"{o.axis_label}: {_short(v)}" for o, v in zip(others, values, strict=True)),
+            name=", ".join(f"{o.axis_label}: {short(v)}" for o, v in zip(others, values, strict=True)),
         )
         for values, rows in groups
     ]
 
 
-def _categories(factor: Factor, curves: Sequence[Curve]) -> list[object]:
-    """Return the values of a factor that is no number, in the order of the study; none of one that is."""
-    values = [value for curve in curves for value in curve.rows[factor.column]]
-    if all(isinstance(value, (int, float, np.number)) and not isinstance(value, bool) for value in values):
-        return []
-    return list(dict.fromkeys(values))
-
-
-def _positions(factor: Factor, values: pd.Series, named: list[object], aside: float) -> Floats:
-    """Return where to draw on the axis, a share of its length aside, so that intervals do not cover each other."""
-    if named:
-        return np.array([named.index(value) for value in values], dtype=float) + 10 * aside
-    x = values.to_numpy(dtype=float)
-    if factor.log:
-        return np.asarray(x * (x.max() / x.min()) ** aside)
-    return np.asarray(x + aside * np.ptp(x))
-
-
-def _scales(factor: Factor, named: list[object], ax: Axes) -> None:
+def _logarithmic_values(ax: Axes) -> None:
     drawn = np.concatenate([np.asarray(line.get_ydata(), dtype=float) for line in ax.get_lines()] or [np.zeros(0)])
     drawn = drawn[np.isfinite(drawn)]
     if drawn.size:
@@ -213,17 +193,6 @@ def _scales(factor: Factor, named: list[object], ax: Axes) -> None:
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
-    if named:
-        ax.set_xticks(range(len(named)), [_short(value) for value in named], rotation=30, ha="right")
-        ax.set_xlim(-0.5, len(named) - 0.5)
-    elif factor.log:
-        ax.set_xscale("log")
-        ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        ax.xaxis.set_minor_formatter(NullFormatter())
-    if not named and 0 < len(factor.values) <= 7:
-        ax.set_xticks([float(row[0]) for row in factor.rows()] if not factor.names else list(factor.names))
-    ax.grid(axis="y", color="#e5e5e5", linewidth=0.8)
-    ax.spines[["top", "right"]].set_visible(False)
 
 
 def _positive(values: pd.Series) -> Floats:
@@ -233,10 +202,6 @@ def _positive(values: pd.Series) -> Floats:
 
 def _axis_text(part: str, unit: str) -> str:
     return f"{part} ({unit})" if part and unit else part or unit
-
-
-def _short(value: object) -> str:
-    return f"{value:g}" if isinstance(value, (float, np.floating)) else str(value)
 
 
 def _caption(factor: Factor, others: Sequence[Factor], scattered: bool) -> str:

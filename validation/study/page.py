@@ -17,6 +17,7 @@ from validation.study.coverage import DIRECTIONS, Honesty, coverage_table, hones
 from validation.study.description import Study
 from validation.study.figures import resolution_picture, study_pictures
 from validation.study.resolution import Resolution, resolution_table, resolutions
+from validation.study.score_figures import score_pictures
 from validation.study.summary import PARTS, QUANTITIES, mean_scores, summarise
 
 HEADINGS = {
@@ -47,8 +48,8 @@ def write_study_report(
         partial.replace(folder / f"{name}.csv")
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = []
-    drawn = [*([resolution_picture(resolved)] if resolved else []), *study_pictures(study, summary)]
-    for picture in drawn:
+    drawn = [*([resolution_picture(resolved)] if resolved else []), *score_pictures(study, scores)]
+    for picture in (*drawn, *study_pictures(study, summary)):
         path = folder / "figures" / f"{picture.name}.png"
         picture.figure.savefig(path, dpi=120)
         data = base64.b64encode(path.read_bytes()).decode("ascii")
