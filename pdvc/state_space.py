@@ -104,7 +104,7 @@ class StateSpace:
         own = np.einsum("jm,kl->jklm", modes, np.eye(motions)).reshape(sections * motions, -1)
         if contraction_of_strain and {CONTRACTION, TRANSLATION_Z} <= set(basis.motions):
             axial, contraction = basis.motions.index(TRANSLATION_Z), basis.motions.index(CONTRACTION)
-            slope = np.gradient(modes, basis.height_mm, axis=0) if sections > 1 else np.zeros_like(modes)
+            slope = _slopes(basis.height_mm, modes) if sections > 1 else np.zeros_like(modes)
             tied = own.reshape(sections, motions, motions, -1)
             tied[:, contraction, axial] -= contraction_of_strain * basis.radius_mm * slope
         self.to_amplitude = np.concatenate([rigid, own], axis=1)
@@ -217,6 +217,20 @@ def _modes(height_mm: Floats, most: int) -> tuple[Floats, Floats]:
     value, vector = linalg.eigh((1 + away) * np.exp(-away))
     kept = np.argsort(value)[::-1][:most]
     return vector[:, kept] * np.sqrt(len(height_mm)), value[kept]
+
+
+def _slopes(height_mm: Floats, values: Floats) -> Floats:
+    """Return at each section (section, ...) the slope along z, per mm, of values that are linear in between.
+
+    It jumps at sections, where contraction does not: the slopes, linear in between, are nearest to it by least squares
+    over the height, which the mean of the two beside a section is not where a neck is narrow.
+    """
+    gap = np.diff(height_mm)
+    mass = np.diag(np.append(gap, 0) + np.append(0, gap)) / 3 + (np.diag(gap, 1) + np.diag(gap, -1)) / 6
+    risen = np.zeros_like(values)
+    risen[:-1] += np.diff(values, axis=0) / 2
+    risen[1:] += np.diff(values, axis=0) / 2
+    return np.asarray(np.linalg.solve(mass, risen))
 
 
 def _gaps(time_s: Floats) -> Floats:
