@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -249,13 +251,18 @@ def _test_radiographs(
     variance = None if noise is None else np.empty(shape, dtype=np.float32)
     view = _viewer(test, calibration, scale, smooth_px)
     left = _noise_left(scale, smooth_px)
-    for t in range(len(test)):
+
+    def read(t: int) -> None:
         grey[t] = view(t)[window]
         if variance is not None and noise is not None:
             fine, slope = grey_noise(test.counts[t], calibration, noise)
             fine += slope**2 * noise.relative_variance(calibration.open_beam, len(experiment.flats))
             variance[t] = left * binned(fine, scale)[window]
-        progress(f"radiographs, scale {scale}", t + 1, len(test))
+
+    # a radiograph is read and filtered by one thread
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        for done, _ in enumerate(pool.map(read, range(len(test)))):
+            progress(f"radiographs, scale {scale}", done + 1, len(test))
     return grey, variance
 
 

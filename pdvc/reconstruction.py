@@ -14,8 +14,10 @@ Only voxels inside a hull are reconstructed; views are read, filtered and used i
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import numba
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -46,8 +48,8 @@ def fdk(
 ) -> NDArray[np.float32]:
     """Reconstruct F on a grid (z, y, x), grey levels per mm, zero outside the hull and in the outermost layer.
 
-    `view(i)` returns radiograph i (row, column) in grey levels. Raises ValueError where the angles do
-    not go all around.
+    `view(i)` returns radiograph i (row, column) in grey levels; several threads ask for theirs at once. Raises
+    ValueError where the angles do not go all around.
     """
     share = angular_share(angle_rad)
     level = replace(geometry, roll_rad=0.0)
@@ -55,22 +57,27 @@ def fdk(
     result = np.zeros((grid.shape[1], grid.shape[2], grid.shape[0]), dtype=np.float32)
     weight, ramp = _cosine_weight(level), _ramp(level)
     beam, across = directions(angle_rad)
-    for start in range(0, len(angle_rad), BATCH):
-        batch = range(start, min(start + BATCH, len(angle_rad)))
-        filtered = np.stack([_filtered(_unrolled(view(i), geometry) * weight * share[i], ramp) for i in batch])
-        _back_project(
-            result,
-            np.ascontiguousarray(filtered.transpose(0, 2, 1)),
-            beam[batch.start : batch.stop],
-            across[batch.start : batch.stop],
-            np.array(grid.origin_mm),
-            grid.voxel_mm,
-            np.array([level.source_axis_mm, level.source_detector_mm, level.pixel_mm]),
-            np.array([level.column_shift_mm, level.row_shift_mm]),
-            inside,
-            first,
-        )
-        progress(task, batch.stop, len(angle_rad))
+
+    def filtered(i: int) -> Image:
+        return _filtered(_unrolled(view(i), geometry) * weight * share[i], ramp)
+
+    # a view is read and filtered by one thread
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        for start in range(0, len(angle_rad), BATCH):
+            batch = range(start, min(start + BATCH, len(angle_rad)))
+            _back_project(
+                result,
+                np.ascontiguousarray(np.stack(list(pool.map(filtered, batch))).transpose(0, 2, 1)),
+                beam[batch.start : batch.stop],
+                across[batch.start : batch.stop],
+                np.array(grid.origin_mm),
+                grid.voxel_mm,
+                np.array([level.source_axis_mm, level.source_detector_mm, level.pixel_mm]),
+                np.array([level.column_shift_mm, level.row_shift_mm]),
+                inside,
+                first,
+            )
+            progress(task, batch.stop, len(angle_rad))
     return framed(np.ascontiguousarray(result.transpose(2, 0, 1)))
 
 

@@ -24,9 +24,11 @@ would.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -254,9 +256,11 @@ def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
 
     rng = np.random.default_rng(0)
     parts = {}
-    for name, covariance in noise.own.items():
-        draws = rng.standard_normal((*covariance.shape[:2], DRAWS))
-        parts[name] = effect(fit.white @ (_root(covariance) @ draws), np.full(DRAWS, 1 / DRAWS))
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        roots = dict(zip(noise.own, pool.map(_root, noise.own.values()), strict=True))
+    for name, root in roots.items():
+        draws = rng.standard_normal((*root.shape[:2], DRAWS))
+        parts[name] = effect(fit.white @ (root @ draws), np.full(DRAWS, 1 / DRAWS))
     parts["process"] = own - np.sum(list(parts.values()), axis=0)
     errors = np.einsum("tnm,tm->tn", fit.white, noise.systematic)[..., None]
     parts["systematic"] = effect(errors, np.ones(1))
@@ -264,9 +268,10 @@ def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
     metric = joined(matrix, slow)
     for name, each in noise.own.items():
         together = noise.parts[name]
-        # a single step has nothing in common with others
-        if together.ndim == metric.ndim:
-            weight, directions = _common(together - joined(each, slow), metric)
+        # a single step has nothing in common with others, and radiographs no noise
+        common = together - joined(each, slow) if together.ndim == metric.ndim else np.zeros(1)
+        if common.any():
+            weight, directions = _common(common, metric)
             moved = np.einsum("ft,fnr->tnr", slow, directions.reshape(len(slow), -1, len(weight)))
             left = effect(process.seen.design @ moved, weight)
             parts[name] = parts[name] + left
@@ -280,10 +285,11 @@ def _of_image_model(fit: _Fit, slow: Floats, blocks: tuple[BlockVectors, ...], s
     turned = design.transpose(0, 2, 1)
     metric = joined(turned @ design, slow)
     metric[np.diag_indices_from(metric)] += WEAK * np.diag(metric)
+    factor = linalg.cho_factor(metric)
 
     def effect(z: Floats) -> Floats:
         """Return what z (function, unknown, draw) does to the amplitudes (step, unknown, draw)."""
-        found = linalg.solve(metric, z.reshape(len(metric), -1), assume_a="pos").reshape(z.shape)
+        found = linalg.cho_solve(factor, z.reshape(len(metric), -1)).reshape(z.shape)
         return process.response(fit.smoothed, fit.deviations, design @ np.einsum("ft,fnd->tnd", slow, found))
 
     draws = np.random.default_rng(0).standard_normal((*design.shape[:2], DRAWS))
@@ -293,8 +299,8 @@ def _of_image_model(fit: _Fit, slow: Floats, blocks: tuple[BlockVectors, ...], s
     some = (z[..., start : start + DRAWS] for start in range(0, z.shape[2], DRAWS))
     squares = np.concatenate([(effect(each) ** 2).sum(axis=0) for each in some], axis=1)
     more = excess(squares, np.einsum("tnn->n", covariance), shape)
-    factor = np.sqrt(np.tile(more, shape[0]))
-    return np.asarray(covariance * (np.outer(factor, factor) - 1))
+    larger = np.sqrt(np.tile(more, shape[0]))
+    return np.asarray(covariance * (np.outer(larger, larger) - 1))
 
 
 def _root(covariance: Floats) -> Floats:
