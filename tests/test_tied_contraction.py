@@ -15,10 +15,10 @@ import pytest
 from pdvc.experiment import Experiment, read_experiment
 from pdvc.measurement import Measurement
 from pdvc.options import MeasureOptions, StageOptions
-from pdvc.process import LEAST_VARIANCE, Deviations, StateSpace
 from pdvc.protocol import measure
 from pdvc.sections import CONTRACTION
 from pdvc.smoother import Smoother
+from pdvc.state_space import LEAST_VARIANCE, Deviations, StateSpace
 from simulator.scanner import simulate
 from simulator.scenario import Scenario
 from simulator.truth import Truth, read_truth
