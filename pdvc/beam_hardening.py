@@ -40,6 +40,8 @@ _DEEP = 0.25
 _ALIKE = 0.8
 """Least share of a path that its neighbours in the row have to have: a pixel that an edge covers in part shows less
 than the attenuation of its mean path."""
+_FEWEST = 1000
+"""Pixels away from edges that are enough."""
 _CURVE_POINTS = 200
 _ROUNDS = 8
 """Times that outline and polynomial are found in turn, at most."""
@@ -176,18 +178,20 @@ def _fit(
     volume = Volume(values=_framed_copy(inside), grid=grid, hull=hull)
     middle = slice(geometry.rows // 5, geometry.rows - geometry.rows // 5)
     window = geometry.cropped(middle.start, middle.stop, 0, geometry.columns)
-    lengths, attenuations = [], []
+    lengths, attenuations, alike = [], [], []
     for i in np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int)):
         rays = ray_vectors(window, angle_rad[i]).stacked()
         length = project_at_rest(volume, rays, (window.rows, window.columns))[0]
-        shortest, longest = ndimage.minimum_filter1d(length, 3), ndimage.maximum_filter1d(length, 3)
-        even = shortest >= _ALIKE * longest
-        lengths.append(length[even])
-        attenuations.append(views[i][middle][even])
+        lengths.append(length.ravel())
+        attenuations.append(views[i][middle].ravel())
+        even = ndimage.minimum_filter1d(length, 3) >= _ALIKE * ndimage.maximum_filter1d(length, 3)
+        alike.append(even.ravel())
     length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)
     powers, longest = np.arange(1, 4), length.max()
-    deep = length > _DEEP * longest
-    a = np.linalg.lstsq(length[deep, None] ** powers, q[deep], rcond=None)[0]
+    used = (length > _DEEP * longest) & np.concatenate(alike)
+    if np.count_nonzero(used) < _FEWEST:  # a sample of a few pixels is all edge
+        used = length > _DEEP * longest
+    a = np.linalg.lstsq(length[used, None] ** powers, q[used], rcond=None)[0]
     curve = np.linspace(_DEEP * longest, longest, _CURVE_POINTS)
     c1, c2, c3 = np.linalg.lstsq((curve[:, None] ** powers @ a)[:, None] ** powers, curve, rcond=None)[0]
     return float(c1), float(c2), float(c3)

@@ -16,7 +16,7 @@ HALF = np.array([0.65, 0.45])
 CENTRE = np.array([0.1, -0.05])
 
 
-def chords(geometry=SCANNER, angles=ANGLES):
+def chords(geometry=SCANNER, angles=ANGLES, half=HALF):
     """Return lengths (view, row, column) of the rays within an endless upright elliptical cylinder, mm."""
     vectors = ray_vectors(geometry, angles).stacked()[:, :, None, None, :]
     row, column = np.indices((geometry.rows, geometry.columns))[..., None]
@@ -24,8 +24,8 @@ def chords(geometry=SCANNER, angles=ANGLES):
     for sub in (np.arange(5) - 2) / 5:
         d = vectors[:, 1] + row * vectors[:, 2] + (column + sub) * vectors[:, 3] - vectors[:, 0]
         length = np.linalg.norm(d, axis=-1)
-        p = (vectors[:, 0, ..., :2] - CENTRE) / HALF
-        d = d[..., :2] / HALF / length[..., None]
+        p = (vectors[:, 0, ..., :2] - CENTRE) / half
+        d = d[..., :2] / half / length[..., None]
         a, b, c = (d * d).sum(-1), (p * d).sum(-1), (p * p).sum(-1) - 1
         result += 2 * np.sqrt(np.maximum(b**2 - a * c, 0)) / a / 5
     return result
@@ -75,6 +75,14 @@ def test_grey_levels_change_with_length_in_proportion_whatever_nodules_and_photo
     scattered = views * (1 + scatter * np.random.default_rng(0).standard_normal(views.shape)).astype(np.float32)
     found = find_outline(lambda i: scattered[i], SCANNER, ANGLES, None)
     assert np.abs(slopes(found.polynomial, length.max()) - 1).max() < 0.04
+
+
+def test_a_sample_of_a_few_pixels_is_all_edge_and_still_has_a_curve():
+    views = attenuation(chords(half=np.array([0.05, 0.04]))).astype(np.float32)
+    found = find_outline(lambda i: views[i], SCANNER, ANGLES, None)
+    grey = levels(np.linspace(0.01, 1, 100) * views.max(), found.polynomial)
+    assert (np.diff(grey) > 0).all()
+    assert grey[-1] == pytest.approx(1, abs=1e-5)
 
 
 def test_the_largest_grey_level_is_one(bar):
