@@ -93,7 +93,7 @@ def rows_of(folder: Path) -> dict[str, Any]:
 
 def jobs(scenario: str = "quick") -> tuple[Job, ...]:
     """Return what is killed: a run of a scenario, a small study, a small comparison."""
-    compared = (str(SCENARIO), "--methods", "gauss-newton,each-step", "--repetitions", "2", "--workers", "2")
+    compared = (str(SCENARIO), "--methods", "gauss-newton,weighted", "--repetitions", "2", "--workers", "2")
     return (
         Job(name=f"run {scenario}", arguments=("run", scenario), found=scores_of),
         Job(name="study", arguments=("study", str(STUDY), "--workers", "2"), found=rows_of),
