@@ -184,13 +184,13 @@ def _fit(
         length = project_at_rest(volume, rays, (window.rows, window.columns))[0]
         lengths.append(length.ravel())
         attenuations.append(views[i][middle].ravel())
-        even = ndimage.minimum_filter1d(length, 3) >= _ALIKE * ndimage.maximum_filter1d(length, 3)
-        alike.append(even.ravel())
+        alike.append((ndimage.minimum_filter1d(length, 3) >= _ALIKE * ndimage.maximum_filter1d(length, 3)).ravel())
     length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)
     powers, longest = np.arange(1, 4), length.max()
-    used = (length > _DEEP * longest) & np.concatenate(alike)
-    if np.count_nonzero(used) < _FEWEST:  # a sample of a few pixels is all edge
-        used = length > _DEEP * longest
+    deep = length > _DEEP * longest
+    even = deep & np.concatenate(alike)
+    # a sample of a few pixels is all edge
+    used = even if np.count_nonzero(even) >= _FEWEST else deep
     a = np.linalg.lstsq(length[used, None] ** powers, q[used], rcond=None)[0]
     curve = np.linspace(_DEEP * longest, longest, _CURVE_POINTS)
     c1, c2, c3 = np.linalg.lstsq((curve[:, None] ** powers @ a)[:, None] ** powers, curve, rcond=None)[0]

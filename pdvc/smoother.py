@@ -268,14 +268,18 @@ def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
     metric = joined(matrix, slow)
     for name, each in noise.own.items():
         together = noise.parts[name]
-        # a single step has nothing in common with others, and radiographs no noise
-        common = together - joined(each, slow) if together.ndim == metric.ndim else np.zeros(1)
-        if common.any():
-            weight, directions = _common(common, metric)
-            moved = np.einsum("ft,fnr->tnr", slow, directions.reshape(len(slow), -1, len(weight)))
-            left = effect(process.seen.design @ moved, weight)
-            parts[name] = parts[name] + left
-            own = own + left
+        # a single step has nothing in common with others
+        if together.ndim != metric.ndim:
+            continue
+        difference = together - joined(each, slow)
+        # nor has the noise of one radiograph with that of another
+        if not difference.any():
+            continue
+        weight, directions = _common(difference, metric)
+        moved = np.einsum("ft,fnr->tnr", slow, directions.reshape(len(slow), -1, len(weight)))
+        left = effect(process.seen.design @ moved, weight)
+        parts[name] = parts[name] + left
+        own = own + left
     return Known(covariance=own / steps, by_source={name: part / steps for name, part in parts.items()})
 
 

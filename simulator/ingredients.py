@@ -23,7 +23,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,11 @@ class Deformation:
     """Rotation vector of the section by bending (step, height, 3), rad."""
     twist_rad: Floats = field(default_factory=lambda: np.zeros(()))
     """Rotation vector of the section by torsion (step, height, 3), before it is bent, rad."""
+
+    @classmethod
+    def at_constant_volume(cls, strain: Floats) -> Self:
+        """Return an axial strain (step, height) with the transverse stretch (1 + strain)^(-1/2)."""
+        return cls(strain=strain, stretch=1 / np.sqrt(1 + strain))
 
 
 class Ingredient(Settings):
@@ -226,7 +231,7 @@ class Creep(Deforming):
         course = np.log1p(since / self.time_s)
         course /= course[-1] if course[-1] > 0 else 1.0
         strain = self.strain * course[:, None] * (drive.area_mm2.min() / drive.area_mm2) ** 4
-        return Deformation(strain=strain, stretch=1 / np.sqrt(1 + strain))
+        return Deformation.at_constant_volume(strain)
 
 
 class Ripple(Deforming):
@@ -257,7 +262,7 @@ class Ripple(Deforming):
             )
         wave = np.sin(2 * np.pi * height / self.wavelength_mm + np.deg2rad(self.phase_deg))
         strain = self.strain * drive.history.load_fraction[:, None] * wave
-        return Deformation(strain=strain, stretch=1 / np.sqrt(1 + strain))
+        return Deformation.at_constant_volume(strain)
 
 
 class Wander(Moving):

@@ -24,9 +24,9 @@ from validation.methods import own
 from validation.methods.registry import find_method
 from validation.scoring.resolution import LAST_STEPS, StrainProfile, recovered_share, recovery, strain_profile
 from validation.study.description import Study, study_file, trials_of
-from validation.study.figures import resolution_picture
 from validation.study.page import write_study_report
 from validation.study.resolution import cut_off_mm, resolution_table, resolutions
+from validation.study.resolution_figures import resolution_picture
 
 HEIGHT = np.linspace(-4.1, 3.9, 61)
 GROWTH = np.linspace(0.5, 1.0, 7)[:, None]
@@ -126,7 +126,7 @@ class TestMotions:
         truth, amplitude, _ = section_wave()
         every_step = np.sqrt(records.STEPS) * np.eye(records.STEPS)
         measured = records.altered(records.measurement(share * amplitude), time_functions=every_step)
-        found = recovery(measured, truth, 4.0)
+        found = recovery(strain_profile(measured, truth), measured, truth, 4.0)
         assert found.recovered == pytest.approx(share, abs=1e-9)
         assert found.recoverable == pytest.approx(1, abs=1e-6)
 
@@ -136,7 +136,8 @@ class TestMotions:
         measured = records.altered(records.measurement(amplitude), time_functions=np.ones((1, records.STEPS)))
         last = load[-LAST_STEPS:]
         due = (load.mean() * last).sum() / (last**2).sum()
-        assert recovery(measured, truth, 4.0).recoverable == pytest.approx(due, rel=1e-4)
+        found = recovery(strain_profile(measured, truth), measured, truth, 4.0)
+        assert found.recoverable == pytest.approx(due, rel=1e-4)
 
     def test_the_profile_lies_between_all_levels_at_the_last_steps(self):
         truth, amplitude, load = section_wave(strain=1e-4)

@@ -232,9 +232,10 @@ def with_wave(result: Result, measurement: Measurement, truth: Truth, scenario: 
     """Return the result with what was recovered of a scenario's `ripple`, and the profile that tells the noise."""
     if "ripple" not in scenario.motion.ingredients:
         return replace(result, scores={**result.scores, **dict.fromkeys(RECOVERY_COLUMNS, math.nan)})
-    found = recovery(measurement, truth, scenario.motion.ripple.wavelength_mm)
-    profile = strain_profile(measurement, truth).measured.astype(np.float32)
-    return Result(scores={**result.scores, **asdict(found)}, arrays={**result.arrays, PROFILE: profile})
+    profile = strain_profile(measurement, truth)
+    found = recovery(profile, measurement, truth, scenario.motion.ripple.wavelength_mm)
+    arrays = {**result.arrays, PROFILE: profile.measured.astype(np.float32)}
+    return Result(scores={**result.scores, **asdict(found)}, arrays=arrays)
 
 
 def compact_errors(measurement: Measurement, truth: Truth) -> dict[str, NDArray[np.float32]]:

@@ -88,13 +88,16 @@ def recovered_share(profile: StrainProfile, wavelength_mm: float) -> float:
     return float((measured * true).sum()) / total if total > 0 else math.nan
 
 
-def recovery(measurement: Measurement, truth: TruePoints, wavelength_mm: float) -> Recovery:
-    """Return how much of a strain wave is recovered, and could be with these sections and time functions."""
+def recovery(profile: StrainProfile, measurement: Measurement, truth: TruePoints, wavelength_mm: float) -> Recovery:
+    """Return how much of a strain wave is recovered, and could be with these sections and time functions.
+
+    `profile` is the measurement's own.
+    """
     motion = measurement.motion
     coefficients, _ = true_coefficients(motion.basis, motion.time_functions, measurement.recording.voxel_mm, truth)
     nearest = np.einsum("ft,fjk->tjk", motion.time_functions, coefficients)
     ideal = replace(measurement, motion=replace(motion, amplitude=nearest))
     return Recovery(
-        recovered=recovered_share(strain_profile(measurement, truth), wavelength_mm),
+        recovered=recovered_share(profile, wavelength_mm),
         recoverable=recovered_share(strain_profile(ideal, truth), wavelength_mm),
     )

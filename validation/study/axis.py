@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,6 +21,8 @@ COLOURS = ("black", BLUE, VERMILION, GREEN, ORANGE, "#CC79A7", "#56B4E9", GREY)
 """Okabe and Ito's, in the order in which curves take them."""
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 MOST_CURVES = len(COLOURS)
+BOUND: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
+"""How what is possible at best is drawn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +62,19 @@ def mark_values(factor: Factor, named: list[object], ax: Axes) -> None:
         ax.xaxis.set_minor_formatter(NullFormatter())
     if not named and 0 < len(factor.values) <= 7:
         ax.set_xticks([float(row[0]) for row in factor.rows()] if not factor.names else list(factor.names))
+    bare(ax)
+
+
+def bare(ax: Axes) -> None:
+    """Leave no more lines than are read."""
     ax.grid(axis="y", color="#e5e5e5", linewidth=0.8)
     ax.spines[["top", "right"]].set_visible(False)
+
+
+def look(k: int, *, joined: bool = True) -> dict[str, Any]:
+    """Return how the k-th curve of a figure is drawn: its points, joined or not."""
+    colour, marker = COLOURS[k % MOST_CURVES], MARKERS[k % MOST_CURVES]
+    return {"color": colour, "marker": marker, "markersize": 4.5, "linewidth": 1.4 if joined else 0}
 
 
 def short(value: object) -> str:

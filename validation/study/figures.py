@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,18 +15,8 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from validation.report.figures import GREY
-from validation.study.axis import (
-    COLOURS,
-    MARKERS,
-    MOST_CURVES,
-    StudyPicture,
-    categories,
-    mark_values,
-    positions,
-    short,
-)
+from validation.study.axis import BOUND, MOST_CURVES, StudyPicture, categories, look, mark_values, positions, short
 from validation.study.description import Factor, Study
-from validation.study.resolution import BIAS, Resolution
 from validation.study.summary import PARTS, QUANTITIES
 
 Floats = NDArray[np.float64]
@@ -35,7 +24,6 @@ Floats = NDArray[np.float64]
 TITLES = ("across the beam", "vertical", "along the beam", "axial strain")
 UNITS = ("voxel", "voxel", "voxel", "")
 PART_NAMES = {"error": "error, rms", "bias": "bias", "random": "random part"}
-BOUND: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.2}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,11 +77,11 @@ def draw_against(factor: Factor, curves: Sequence[Curve], quantity: str, ax: Axe
     for k, curve in enumerate(curves):
         rows = curve.rows if named else curve.rows.sort_values(factor.column)
         x = positions(factor, rows[factor.column], named, (k - (len(curves) - 1) / 2) * 0.012)
-        colour, marker = COLOURS[k % MOST_CURVES], MARKERS[k % MOST_CURVES]
         values = _positive(rows[f"{curve.part}_{quantity}"])
         low, high = (rows[f"{curve.part}_{quantity}_{end}"].to_numpy(dtype=float) for end in ("low", "high"))
-        width = 1.4 if joined and not named and not rows[factor.column].duplicated().any() else 0
-        ax.plot(x, values, color=colour, marker=marker, markersize=4.5, label=curve.name, linewidth=width)
+        own = look(k, joined=joined and not named and not rows[factor.column].duplicated().any())
+        colour = own["color"]
+        ax.plot(x, values, label=curve.name, **own)
         known = np.isfinite(values) & np.isfinite(low) & np.isfinite(high)
         floor = np.where(low > 0, low, values / 10)  # an interval down to zero runs out of a logarithmic axis
         ax.vlines(x[known], floor[known], high[known], color=colour, linewidth=1.2, alpha=0.75)
@@ -103,68 +91,6 @@ def draw_against(factor: Factor, curves: Sequence[Curve], quantity: str, ax: Axe
             ax.plot(x, _positive(rows[f"bound_{quantity}"]), color=colour if one_part else GREY, **style)
     _logarithmic_values(ax)
     mark_values(factor, named, ax)
-    return ax
-
-
-def resolution_picture(found: Sequence[Resolution]) -> StudyPicture:
-    """Return the figure of what each method recovers of a strain wave, and its noise beside it."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
-    draw_recovered(found, left)
-    draw_strain_noise(found, right)
-    handles, labels = left.get_legend_handles_labels()
-    handles.append(Line2D([], [], color=GREY, **BOUND))
-    figure.legend(handles, [*labels, "at best"], loc="outside right upper", frameon=False)
-    caption = (
-        "Share of the amplitude of a strain sinusoidal in height that each method recovers, with 95 % bootstrap "
-        "intervals over the repetitions; dashed, what its sections and time functions could hold at best. Beyond the "
-        f"spatial resolution a curve stays between {1 - BIAS:g} and {1 + BIAS:g}, grey. Right: the noise of the "
-        "strain at a step, 1 sigma."
-    )
-    return StudyPicture(name="spatial_resolution", caption=caption, figure=figure)
-
-
-def draw_recovered(found: Sequence[Resolution], ax: Axes) -> Axes:
-    """Draw the shares that are recovered, and that could be, against the wavelength; a line for each method."""
-    ax.axhspan(1 - BIAS, 1 + BIAS, color="#eeeeee", zorder=0)
-    for k, each in enumerate(found):
-        look = _look(k)
-        value, low, high = (
-            np.array([getattr(share, end) for share in each.recovered]) for end in ("value", "low", "high")
-        )
-        ax.plot(each.wavelength_mm, value, label=_called(each), **look)
-        ax.plot(each.wavelength_mm, each.recoverable, color=look["color"], **BOUND)
-        ax.vlines(each.wavelength_mm, low, high, color=look["color"], linewidth=1.2, alpha=0.75)
-    ax.set(ylabel="amplitude recovered / true")
-    return _against_wavelength(found, ax)
-
-
-def draw_strain_noise(found: Sequence[Resolution], ax: Axes) -> Axes:
-    """Draw the noise of the strain, in thousandths, against the wavelength; a line for each method."""
-    for k, each in enumerate(found):
-        ax.plot(each.wavelength_mm, 1e3 * each.noise, label=_called(each), **_look(k))
-    ax.set(ylabel="noise of the strain, 1 sigma (10⁻³)")
-    ax.set_ylim(bottom=0)
-    return _against_wavelength(found, ax)
-
-
-def _look(k: int) -> dict[str, Any]:
-    return {"color": COLOURS[k % MOST_CURVES], "marker": MARKERS[k % MOST_CURVES], "markersize": 4.5, "linewidth": 1.4}
-
-
-def _called(each: Resolution) -> str:
-    return ", ".join(short(value) for value in each.combination.values()) or "all runs"
-
-
-def _against_wavelength(found: Sequence[Resolution], ax: Axes) -> Axes:
-    lengths = found[0].wavelength_mm.tolist()
-    # limits of their own, as a logarithmic axis finds none where nothing was measured
-    ax.set(xlabel="wavelength (mm)", xscale="log", xlim=(lengths[0] / 1.1, lengths[-1] * 1.1), xticks=lengths)
-    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    ax.minorticks_off()
-    ax.grid(axis="y", color="#e5e5e5", linewidth=0.8)
-    ax.spines[["top", "right"]].set_visible(False)
     return ax
 
 

@@ -15,8 +15,9 @@ from validation.report.template import template
 from validation.scoring.bootstrap import Estimate
 from validation.study.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
 from validation.study.description import Study
-from validation.study.figures import resolution_picture, study_pictures
+from validation.study.figures import study_pictures
 from validation.study.resolution import Resolution, resolution_table, resolutions
+from validation.study.resolution_figures import resolution_picture
 from validation.study.score_figures import score_pictures
 from validation.study.summary import PARTS, QUANTITIES, mean_scores, summarise
 

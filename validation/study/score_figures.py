@@ -9,16 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from validation.study.axis import (
-    COLOURS,
-    MARKERS,
-    MOST_CURVES,
-    StudyPicture,
-    categories,
-    mark_values,
-    positions,
-    short,
-)
+from validation.study.axis import MOST_CURVES, StudyPicture, categories, look, mark_values, positions, short
 from validation.study.description import Factor, Study
 
 
@@ -36,8 +27,8 @@ def draw_score(factor: Factor, name: str, curves: Sequence[tuple[str, pd.DataFra
     for k, (said, rows) in enumerate(curves):
         ordered = rows if named else rows.sort_values(factor.column)
         x = positions(factor, ordered[factor.column], named, (k - (len(curves) - 1) / 2) * 0.012)
-        width = 0 if named or ordered[factor.column].duplicated().any() else 1.4
-        ax.plot(x, ordered[name], color=COLOURS[k], marker=MARKERS[k], markersize=4.5, linewidth=width, label=said)
+        joined = not named and not ordered[factor.column].duplicated().any()
+        ax.plot(x, ordered[name], label=said, **look(k, joined=joined))
     mark_values(factor, named, ax)
     return ax
 
