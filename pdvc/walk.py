@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
+from numba.core.compiler import Compiler
 from numpy.typing import NDArray
 
 from pdvc.volume import Hull
@@ -41,9 +42,34 @@ BAND_ROWS = 16
 BLOCK_COLUMNS = 16
 """Columns of a block, for which c is summed by itself."""
 
+LANES = BLOCK_COLUMNS
+"""Neighbouring rays of a row that are walked side by side, each in a lane of the processor's vectors."""
+
 _f = np.float32
 _BIG = 1e30
+_LEAST_SLOPE = 1e-12
+_X, _Y, _Z = 0, LANES, 2 * LANES
 _NORMALS32 = np.ascontiguousarray(Hull.normals().T, dtype=np.float32)
+
+
+class _Apart(Compiler):  # type: ignore[misc]
+    """Compile in the knowledge that arrays given to a function do not overlap.
+
+    What is written can then not be what is read, and loops over rays become vectors of rays.
+    """
+
+    def define_pipelines(self):  # type: ignore[no-untyped-def]
+        """Return numba's own passes."""
+        self.state.flags.noalias = True
+        return super().define_pipelines()
+
+
+def _each_ray(**options):  # type: ignore[no-untyped-def]
+    """Return the decorator of a kernel that does one thing for each ray of a block: of arrays that do not overlap.
+
+    An array of such a kernel holds one component after the other, each of `LANES` rays.
+    """
+    return njit(nogil=True, cache=True, error_model="numpy", pipeline_class=_Apart, **options)
 
 
 class Scene(NamedTuple):
@@ -111,7 +137,7 @@ def walk_bands(scene, steps, sums, with_sensitivities):  # type: ignore[no-untyp
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore[no-untyped-def]
-    """Walk the rays of one band of rows of step t."""
+    """Walk the rays of one band of rows of step t, a block of neighbouring columns at a time."""
     volume, shape, place, support, heights, patterns, voxel_mm, phase64 = scene
     phase = _f(phase64)
     box, rays, maps, target = steps.box[t], steps.rays[t], steps.maps[t], steps.target[t]
@@ -120,116 +146,306 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
     residual, kept = sums.residual[t], sums.kept[t]
     rows, columns = target.shape
     n, motions = patterns.shape[0], patterns.shape[1]
-    nx, ny = shape[2], shape[1]
+    nx, ny, layers = shape[2], shape[1], shape[0]
     row_of, layer = np.uint32(nx), np.uint32(nx * ny)
-    # strides of the axis across the planes, of the other horizontal axis, and of z; largest place along the last two,
-    # just below the last voxel, so that the next one is always there to interpolate with
-    to_x, most_x = (np.uint32(1), row_of, layer), (_f(ny - 1.0001), _f(shape[0] - 1.0001))
-    to_y, most_y = (row_of, np.uint32(1), layer), (_f(nx - 1.0001), _f(shape[0] - 1.0001))
-    # scratch, made once for all rays; s holds the sensitivities of one pixel
-    normals, limit16 = _NORMALS32, np.empty(_NORMALS32.shape[1], np.float32)
-    s = np.zeros(max(vectors.shape[1], 1))
-    base, along, k12 = np.empty(3), np.empty(3), np.empty(12)
+    # strides of the axis across the planes, of the other horizontal axis, and of z
+    strides_x, strides_y = (np.uint32(1), row_of, layer), (row_of, np.uint32(1), layer)
+    # scratch, made once for all rays: what is told of each ray of a block, component by component
+    base, along, reach = np.empty(3 * LANES), np.empty(3 * LANES), np.empty(LANES)
+    enter, leave = np.empty(LANES), np.empty(LANES)
+    a, b, inner_a, inner_b = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
+    s0, s1, path = np.empty(LANES), np.empty(LANES), np.empty(9 * LANES)
+    limit = np.empty(_NORMALS32.shape[1], np.float32)
+    ends, left_from, left_to = np.empty(6 * LANES), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    planes, path32 = np.empty(2 * LANES, np.float32), np.empty(9 * LANES, np.float32)
+    turn = np.empty(LANES)
+    sums8 = np.empty(8 * LANES, np.float32)
+    value, nine, twelve = np.empty(LANES), np.empty(9 * LANES), np.empty(12 * LANES)
+    s, used, weighted = np.zeros(vectors.shape[1] * LANES), np.empty(LANES), np.empty(LANES)
     middle = 0.5 * (box[0] + box[1])
     # rows outside, columns inside: neighbours of a row walk through the same two layers of voxels, still in the cache
     for row in range(band * BAND_ROWS, min((band + 1) * BAND_ROWS, rows)):
-        for column in range(columns):
-            reach = _aim(rays, middle, row, column, base, along)
-            # one axis for the whole ray: sums of neighbouring intervals must be over the same planes
-            along_x = abs(along[0]) >= abs(along[1])
-            value = 0.0
-            a, end = _clip_box(box, base, along)
-            # a box that reaches the source goes on behind it, where no band's sections were looked for
-            a = max(a, -reach)
-            k_first, k_last = n, -1
-            rising = along[2] >= 0
-            # from section to section: between two of them the moved ray is one polynomial
-            while a < end:
-                # the interval between sections k and k + 1 that the ray enters at a
-                z = base[2] + a * along[2]
-                k = -1
-                while k + 1 < n and (heights[k + 1] < z or (rising and heights[k + 1] == z)):
-                    k += 1
-                # it leaves it at b
-                b = end
-                wall = k + 1 if rising else k
-                if n > 1 and 0 <= wall < n and abs(along[2]) > 1e-9:
-                    b = min(end, (heights[wall] - base[2]) / along[2])
-                    if b <= a:  # rounding left the ray on the wall: step over it
-                        b = min(end, a + 1e-7)
-                # the upper section's share there is s0 + s1 l; beyond the outermost section that one alone counts
-                j0, j1, s0, s1 = max(k, 0), min(max(k, 0) + 1, n - 1), 0.0, 0.0
-                if 0 <= k < n - 1:
-                    s1 = along[2] / (heights[k + 1] - heights[k])
-                    s0 = (base[2] - heights[k]) / (heights[k + 1] - heights[k])
-                else:
-                    j1 = j0
-                path = _quadratic(maps[j0], maps[j1], base, along, s0, s1)
-                inner_a, inner_b = _clip_hull(place, support, normals, limit16, shape[0], a, b, path)
-                if inner_a < inner_b:
-                    ax, bx, cx, ay, by, cy, az, bz, cz = path
-                    if along_x:
-                        turned, strides, limit, count = (ax, bx, cx, ay, by, cy, az, bz, cz), to_x, most_x, nx
-                    else:
-                        turned, strides, limit, count = (ay, by, cy, ax, bx, cx, az, bz, cz), to_y, most_y, ny
-                    first, last = _planes(turned, inner_a, inner_b, count)
-                    if last > first:
-                        am, bm, cm, ao, bo, co, az, bz, cz = turned
-                        path32 = (_f(am), _f(bm), _f(cm), _f(ao), _f(bo), _f(co), _f(az), _f(bz), _f(cz))
-                        # length of the ray from plane to plane, mm: F is per mm
-                        scale = voxel_mm / abs(bm)
-                        if with_sensitivities:
-                            sums8 = _sum_all(volume, strides, limit, first, last, path32, phase)
-                            value += sums8[0] * scale
-                            nine = _nine_sums(sums8, turned, along_x)
-                            if k_last < 0:
-                                k_first, k_last = j0, j1
-                            k_first, k_last = min(k_first, j0), max(k_last, j1)
-                            # both sections of the interval, each with its hat: 1 - s and s
-                            at = (j0 - low) * motions
-                            out = s[at : at + motions]
-                            if j0 == j1:
-                                _add_section(patterns[j0], 1.0, 0.0, base, along, nine, scale, k12, out)
-                            else:
-                                _add_section(patterns[j0], 1.0 - s0, -s1, base, along, nine, scale, k12, out)
-                                at = (j1 - low) * motions
-                                out = s[at : at + motions]
-                                _add_section(patterns[j1], s0, s1, base, along, nine, scale, k12, out)
-                        else:
-                            value += scale * _sum_values(volume, strides, limit, first, last, path32, phase)
-                a = b
-            rho = value - target[row, column]
-            residual[row, column] = rho
-            w = weight[row, column]
-            if w > 0:
-                chi2[band] += w * rho * rho
-            if k_last >= 0:
-                # only the sections that this ray met: S of a pixel is zero elsewhere, and so are its products
-                first, last = (k_first - low) * motions, (k_last + 1 - low) * motions
-                if w > 0:
-                    _add_outer(matrix, vectors[column // BLOCK_COLUMNS], s, first, last, w, rho)
+        for block in range(vectors.shape[0]):
+            column0 = block * LANES
+            count = min(LANES, columns - column0)
+            _aim(rays, middle, row, column0, base, along, reach)
+            _clip_box(box, base, along, reach, count, enter, leave)
+            value[:] = 0.0
+            first_section, last_section = n, -1
+            lowest, highest = _heights_met(base, along, enter, leave)
+            # from section to section: between two of them a moved ray is one polynomial
+            k = -1 if n > 1 else 0
+            while k + 1 < n and heights[k + 1] < lowest:
+                k += 1
+            while lowest <= highest and k < n and (k < 0 or n == 1 or heights[k] <= highest):
+                # between sections k and k + 1; beyond the outermost section that one alone counts
+                j0, j1 = max(k, 0), min(k + 1, n - 1)
+                bottom = heights[k] if n > 1 and k >= 0 else -_BIG
+                top = heights[k + 1] if k + 1 < n else _BIG
+                k += 1
+                _between(bottom, top, base, along, enter, leave, a, b)
+                _share(bottom, 1.0 / (top - bottom) if j0 != j1 else 0.0, base, along, s0, s1)
+                _path(maps[j0], maps[j1], s0, s1, base, along, path)
+                _ends(path, a, b, ends)
+                if not _limits(place, support, a, b, ends, limit):
+                    continue
+                _clip_hull(_NORMALS32, limit, layers, ends, a, b, left_from, left_to, inner_a, inner_b)
+                # one axis for the whole ray: sums of neighbouring intervals must be over the same planes
+                for along_x in (True, False):
+                    m, o = (_X, _Y) if along_x else (_Y, _X)
+                    _planes(path, m, o, along, inner_a, inner_b, nx if along_x else ny, planes, turn, path32)
+                    first, last = _range_of(planes)
+                    if first >= last:
+                        continue
+                    strides = strides_x if along_x else strides_y
+                    # largest places, just below the last voxel, so that the next one is always there
+                    most = _f((ny if along_x else nx) - 1.0001), _f(layers - 1.0001)
+                    if not with_sensitivities:
+                        _sum_values(volume, strides, most, first, last, phase, path32, planes, sums8)
+                        _add_value(sums8, turn, voxel_mm, value)
+                        continue
+                    _sum_all(volume, strides, most, first, last, phase, path32, planes, sums8)
+                    _add_value(sums8, turn, voxel_mm, value)
+                    _nine_sums(sums8, turn, path, m, o, voxel_mm, nine)
+                    first_section, last_section = min(first_section, j0), max(last_section, j1)
+                    # both sections of the interval, each with its hat: 1 - s and s
+                    _twelve(nine, 1.0, -1.0 if j0 != j1 else 0.0, s0, s1, base, along, twelve)
+                    _add_section(patterns[j0], twelve, s, (j0 - low) * motions)
+                    if j0 != j1:
+                        _twelve(nine, 0.0, 1.0, s0, s1, base, along, twelve)
+                        _add_section(patterns[j1], twelve, s, (j1 - low) * motions)
+            for ray in range(LANES):
+                w, rho = _f(0), _f(0)
+                if ray < count:
+                    column = column0 + ray
+                    rho = _f(value[ray] - target[row, column])
+                    residual[row, column] = rho
+                    w = weight[row, column]
+                # a pixel of no weight counts for nothing, even if it holds no number
+                used[ray] = w if w > 0 else 0.0
+                weighted[ray] = w * np.float64(rho) if w > 0 else 0.0
+                chi2[band] += weighted[ray] * rho if w > 0 else 0.0
+            # only the sections that these rays met: S is zero elsewhere, and so are its products
+            if last_section >= 0:
+                first, last = (first_section - low) * motions, (last_section + 1 - low) * motions
+                _add_products(s, first, last, used, weighted, matrix, vectors[block])
                 if kept.size > 0:
-                    for i in range(first, last):
-                        kept[row, column, i] = s[i]
-                s[first:last] = 0.0
+                    for ray in range(count):
+                        for i in range(first, last):
+                            kept[row, column0 + ray, i] = s[i * LANES + ray]
+                s[first * LANES : last * LANES] = 0.0
+
+
+@_each_ray()
+def _aim(rays, middle, row, column0, base, along, reach):  # type: ignore[no-untyped-def]
+    """Write the rays base + l along to pixels' centres, along of length 1, and the distances base - source.
+
+    l = 0 is where a ray passes the middle of the sample: l stays small, so that single precision is enough.
+    """
+    for ray in range(LANES):
+        column = column0 + ray
+        x = rays[1, 0] + row * rays[2, 0] + column * rays[3, 0] - rays[0, 0]
+        y = rays[1, 1] + row * rays[2, 1] + column * rays[3, 1] - rays[0, 1]
+        z = rays[1, 2] + row * rays[2, 2] + column * rays[3, 2] - rays[0, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        away = x * (middle[0] - rays[0, 0]) + y * (middle[1] - rays[0, 1]) + z * (middle[2] - rays[0, 2])
+        along[_X + ray], along[_Y + ray], along[_Z + ray] = x, y, z
+        base[_X + ray] = rays[0, 0] + away * x
+        base[_Y + ray] = rays[0, 1] + away * y
+        base[_Z + ray] = rays[0, 2] + away * z
+        reach[ray] = away
+
+
+@_each_ray()
+def _clip_box(box, base, along, reach, count, enter, leave):  # type: ignore[no-untyped-def]
+    """Write the parts [enter, leave] of the rays that lie in a box; empty where enter >= leave, as beyond `count`."""
+    for ray in range(LANES):
+        # a ray along a face of the box is taken as nearly along it: inside it goes on for ever, outside it is never in
+        x, y, z = _steep(along[_X + ray]), _steep(along[_Y + ray]), _steep(along[_Z + ray])
+        x0, x1 = (box[0, 0] - base[_X + ray]) / x, (box[1, 0] - base[_X + ray]) / x
+        y0, y1 = (box[0, 1] - base[_Y + ray]) / y, (box[1, 1] - base[_Y + ray]) / y
+        z0, z1 = (box[0, 2] - base[_Z + ray]) / z, (box[1, 2] - base[_Z + ray]) / z
+        start = max(max(min(x0, x1), min(y0, y1)), min(z0, z1))
+        end = min(min(max(x0, x1), max(y0, y1)), max(z0, z1))
+        # a box that reaches the source goes on behind it, where no band's sections were looked for
+        start = max(start, -reach[ray])
+        met = (start < end) & (ray < count)
+        enter[ray] = start if met else 0.0
+        leave[ray] = end if met else 0.0
 
 
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
-def _aim(rays, middle, row, column, base, along):  # type: ignore[no-untyped-def]
-    """Write the ray base + l along to a pixel's centre, along of length 1, and return the distance base - source.
+def _steep(slope):  # type: ignore[no-untyped-def]
+    """Return a slope, or one that may be divided by where it is nearly zero."""
+    return slope if abs(slope) > _LEAST_SLOPE else _LEAST_SLOPE
 
-    l = 0 is where the ray passes the middle of the sample: l stays small, so that single precision is enough.
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _heights_met(base, along, enter, leave):  # type: ignore[no-untyped-def]
+    """Return the lowest and the highest z that the rays meet, with room for rounding; the first is higher if none."""
+    low, high = _BIG, -_BIG
+    for ray in range(LANES):
+        if enter[ray] < leave[ray]:
+            z0 = base[_Z + ray] + enter[ray] * along[_Z + ray]
+            z1 = base[_Z + ray] + leave[ray] * along[_Z + ray]
+            low, high = min(low, min(z0, z1)), max(high, max(z0, z1))
+    return low - 1e-6, high + 1e-6
+
+
+@_each_ray()
+def _between(bottom, top, base, along, enter, leave, a, b):  # type: ignore[no-untyped-def]
+    """Write the parts [a, b] of the rays between two heights; both zero where there is none.
+
+    Both intervals beside a wall find it at the same place, so that no plane is lost or counted twice.
     """
-    length, reach = 0.0, 0.0
+    for ray in range(LANES):
+        z = _steep(along[_Z + ray])
+        one, two = (bottom - base[_Z + ray]) / z, (top - base[_Z + ray]) / z
+        start, end = max(enter[ray], min(one, two)), min(leave[ray], max(one, two))
+        a[ray] = start if start < end else 0.0
+        b[ray] = end if start < end else 0.0
+
+
+@_each_ray()
+def _share(bottom, per_gap, base, along, s0, s1):  # type: ignore[no-untyped-def]
+    """Write the upper section's share along the rays, s0 + s1 l; `per_gap` is 1 / (top - bottom), 0 for one alone."""
+    for ray in range(LANES):
+        s0[ray] = (base[_Z + ray] - bottom) * per_gap
+        s1[ray] = along[_Z + ray] * per_gap
+
+
+@_each_ray()
+def _path(first, second, s0, s1, base, along, path):  # type: ignore[no-untyped-def]
+    """Write the coefficients of the moved rays x'(l) = x - u(x), u = (1 - s) u_first + s u_second.
+
+    For each of x, y, z those of 1, l and l^2: (coordinate, power, ray).
+    """
     for i in range(3):
-        along[i] = rays[1, i] + row * rays[2, i] + column * rays[3, i] - rays[0, i]
-        length += along[i] * along[i]
+        for ray in range(LANES):
+            x, y, z = base[_X + ray], base[_Y + ray], base[_Z + ray]
+            dx, dy, dz = along[_X + ray], along[_Y + ray], along[_Z + ray]
+            # u of both sections along the ray: p + q l, and what the second has more, dp + dq l
+            p = first[i, 0] * x + first[i, 1] * y + first[i, 2] * z + first[i, 3]
+            q = first[i, 0] * dx + first[i, 1] * dy + first[i, 2] * dz
+            dp = second[i, 0] * x + second[i, 1] * y + second[i, 2] * z + second[i, 3] - p
+            dq = second[i, 0] * dx + second[i, 1] * dy + second[i, 2] * dz - q
+            path[3 * LANES * i + ray] = base[LANES * i + ray] - p - s0[ray] * dp
+            path[3 * LANES * i + LANES + ray] = along[LANES * i + ray] - q - s0[ray] * dq - s1[ray] * dp
+            path[3 * LANES * i + 2 * LANES + ray] = -s1[ray] * dq
+
+
+@_each_ray()
+def _ends(path, a, b, ends):  # type: ignore[no-untyped-def]
+    """Write x', y', z' at a, then at b (end, coordinate, ray)."""
     for i in range(3):
-        along[i] /= np.sqrt(length)
-        reach += along[i] * (middle[i] - rays[0, i])
-    for i in range(3):
-        base[i] = rays[0, i] + reach * along[i]
-    return reach
+        for ray in range(LANES):
+            one, slope = path[3 * LANES * i + ray], path[3 * LANES * i + LANES + ray]
+            bend = path[3 * LANES * i + 2 * LANES + ray]
+            ends[LANES * i + ray] = one + a[ray] * (slope + a[ray] * bend)
+            ends[3 * LANES + LANES * i + ray] = one + b[ray] * (slope + b[ray] * bend)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _limits(place, support, a, b, ends, limit):  # type: ignore[no-untyped-def]
+    """Write the supports (direction,) of the hull of all slabs that the moved rays go through; False if there is none.
+
+    Moved rays are taken as straight between a and b.
+    """
+    low, high = _BIG, -_BIG
+    for ray in range(LANES):
+        if a[ray] < b[ray]:
+            za, zb = ends[_Z + ray], ends[3 * LANES + _Z + ray]
+            low, high = min(low, min(za, zb)), max(high, max(za, zb))
+    if low > high:
+        return False
+    first = max(int(np.floor((low - place[0]) / place[1])), 0)
+    last = min(int(np.floor((high - place[0]) / place[1])), support.shape[0] - 1)
+    if first > last:
+        return False
+    limit[:] = support[first]
+    for slab in range(first + 1, last + 1):
+        for k in range(len(limit)):
+            limit[k] = max(limit[k], support[slab, k])
+    return True
+
+
+@_each_ray(fastmath=True, boundscheck=False)
+def _clip_hull(normals, limit, layers, ends, a, b, low, high, inner_a, inner_b):  # type: ignore[no-untyped-def]
+    """Shrink [a, b] to where the moved rays, taken as straight between a and b, meet a hull; to nothing elsewhere.
+
+    They also stay inside the volume's first and last layer but one: where the volume is cut in height, the step from
+    the sample to the empty outermost layer is no texture. Shares `low` to `high` of [a, b] are left, in single
+    precision.
+    """
+    for ray in range(LANES):
+        za, zb = ends[_Z + ray], ends[3 * LANES + _Z + ray]
+        one = _left_above(_f(za - 1), _f(zb - 1))
+        two = _left_above(_f(layers - 2 - za), _f(layers - 2 - zb))
+        low[ray], high[ray] = max(one[0], two[0]), min(one[1], two[1])
+    for k in range(len(limit)):
+        for ray in range(LANES):
+            # depths below the half-plane's edge at both ends
+            da = limit[k] - (normals[0, k] * _f(ends[_X + ray]) + normals[1, k] * _f(ends[_Y + ray]))
+            db = limit[k] - (
+                normals[0, k] * _f(ends[3 * LANES + _X + ray]) + normals[1, k] * _f(ends[3 * LANES + _Y + ray])
+            )
+            left = _left_above(da, db)
+            low[ray], high[ray] = max(low[ray], left[0]), min(high[ray], left[1])
+    for ray in range(LANES):
+        met = (low[ray] < high[ray]) & (a[ray] < b[ray])
+        inner_a[ray] = a[ray] + low[ray] * (b[ray] - a[ray]) if met else 0.0
+        # to the wall itself, where nothing is cut: the next interval begins there
+        end = b[ray] if high[ray] >= _f(1) else a[ray] + high[ray] * (b[ray] - a[ray])
+        inner_b[ray] = end if met else 0.0
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, inline="always")
+def _left_above(da, db):  # type: ignore[no-untyped-def]
+    """Return the part of [0, 1] where what is da at 0 and db at 1 is positive; from 2 on if nowhere."""
+    # crossed where the line between them is zero
+    t = da / (da - db)
+    enter = _f(2) if db < 0 else t
+    return enter if da < 0 else _f(0), t if db < 0 else _f(1)
+
+
+@_each_ray()
+def _planes(path, m, o, along, a, b, count, planes, turn, path32):  # type: ignore[no-untyped-def]
+    """Write the planes [first, last) across the axis m that the rays cross between a and b: (end, ray).
+
+    Rays that follow the other axis more cross none, as do those without an interval. `turn` is 1 / x'_m at l = 0, zero
+    for rays that cross none; `path32` holds the coefficients of x' for the axes m, o, z in single precision, but
+    c_m / b_m for c_m and 1 / b_m for b_m.
+    """
+    for ray in range(LANES):
+        one, slope, bend = path[3 * m + ray], path[3 * m + LANES + ray], path[3 * m + 2 * LANES + ray]
+        # half open, on the side of a: a plane exactly on a wall between two intervals belongs to the later one
+        start, end = one + a[ray] * (slope + a[ray] * bend), one + b[ray] * (slope + b[ray] * bend)
+        up = end >= start
+        first = np.ceil(start) if up else np.floor(end) + 1
+        last = np.ceil(end) if up else np.floor(start) + 1
+        x, y = abs(along[_X + ray]), abs(along[_Y + ray])
+        ours = (x >= y) if m == _X else (x < y)
+        first, last = max(first, 0.0), min(last, float(count))
+        met = ours & (a[ray] < b[ray]) & (first < last)
+        planes[ray] = _f(first if met else _BIG)
+        planes[LANES + ray] = _f(last if met else -_BIG)
+        inverse = 1.0 / slope if met else 0.0
+        turn[ray] = inverse
+        path32[ray], path32[LANES + ray], path32[2 * LANES + ray] = _f(one), _f(inverse), _f(bend * inverse)
+    for power in range(3):
+        for ray in range(LANES):
+            path32[(3 + power) * LANES + ray] = _f(path[3 * o + power * LANES + ray])
+            path32[(6 + power) * LANES + ray] = _f(path[3 * _Z + power * LANES + ray])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _range_of(planes):  # type: ignore[no-untyped-def]
+    """Return the first plane that any ray crosses, and one past the last; no range if there is none."""
+    first, last = planes[0], planes[LANES]
+    for ray in range(1, LANES):
+        first, last = min(first, planes[ray]), max(last, planes[LANES + ray])
+    return (int(first), int(last)) if first < last else (0, 0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath=True, inline="always")
@@ -239,216 +455,163 @@ def _in_phase(f, phase):  # type: ignore[no-untyped-def]
     return f + phase * away * (_f(1) - _f(2) * f), _f(1) + phase * (_f(1) - _f(6) * away)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _sum_all(volume, strides, limit, first, last, path, phase):  # type: ignore[no-untyped-def]
-    """Sum F times 1, l, and d_o F times 1, l, l^2, over the planes first <= k < last that the ray crosses.
+@_each_ray(fastmath=True, boundscheck=False)
+def _sum_all(volume, strides, most, first, last, phase, path, planes, sums):  # type: ignore[no-untyped-def]
+    """Sum F times 1, l, and d_o F times 1, l, l^2, over the planes that each ray crosses: (sum, ray).
 
-    `path` holds the coefficients of x'(l) for the axes m, o, z, and `strides` and `limit` theirs. This loop is where
-    the time goes (docs/performance.md): no branches, four gathers, and single precision, so that a vector holds twice
-    as many planes.
+    `strides` of the axes m, o, z; `most` the largest places along o and z. This loop is where the time goes
+    (docs/performance.md): neighbouring rays side by side, without branches, four gathers, in single precision, so that
+    a vector holds as many rays as can be.
     """
-    am, bm, cm, ao, bo, co, az, bz, cz = path
     stride_m, stride_o, stride_z = strides
-    most_o, most_z = limit
-    turn = _f(1) / bm
-    bend = cm * turn
-    v0 = v1 = g0 = g1 = g2 = h0 = h1 = h2 = _f(0)
+    most_o, most_z = most
+    sums[:] = _f(0)
     for k in range(first, last):
-        # l at which x'_m = k, from am + bm l + cm l^2 = k by the series in the small curvature cm / bm
-        t = (_f(k) - am) * turn
-        t -= bend * t * t * (_f(1) - _f(2) * bend * t)
-        # length from plane to plane, here over its value 1 / bm at l = 0
-        share = _f(1) - _f(2) * bend * t
-        # rounding may take the ray out of the volume, where it would read other memory
-        o = min(max(ao + t * (bo + t * co), _f(0)), most_o)
-        z = min(max(az + t * (bz + t * cz), _f(0)), most_z)
-        io, iz = np.int32(o), np.int32(z)
-        fo, slope_o = _in_phase(o - _f(io), phase)
-        fz, slope_z = _in_phase(z - _f(iz), phase)
-        # unsigned indices: signed ones of 32 bits were slower, and these reach twice as far
-        p = np.uint32(iz * stride_z + io * stride_o + np.uint32(k) * stride_m)
-        q = p + stride_z
-        # the four voxels around the place in this plane, and the bilinear value with its exact derivatives
-        a00, a01, a10, a11 = volume[p], volume[p + stride_o], volume[q], volume[q + stride_o]
-        d0, d1 = a01 - a00, a11 - a10
-        low = a00 + fo * d0
-        dz = a10 + fo * d1 - low
-        value = share * (low + fz * dz)
-        do = share * slope_o * (d0 + fz * (d1 - d0))
-        dz *= share * slope_z
-        v0 += value
-        v1 += t * value
-        g0 += do
-        h0 += dz
-        do *= t
-        dz *= t
-        g1 += do
-        h1 += dz
-        g2 += t * do
-        h2 += t * dz
-    return v0, v1, g0, g1, g2, h0, h1, h2
+        plane, at = _f(k), np.uint32(k) * stride_m
+        for ray in range(LANES):
+            am, turn, bend = path[ray], path[LANES + ray], path[2 * LANES + ray]
+            ao, bo, co = path[3 * LANES + ray], path[4 * LANES + ray], path[5 * LANES + ray]
+            az, bz, cz = path[6 * LANES + ray], path[7 * LANES + ray], path[8 * LANES + ray]
+            # l at which x'_m = k, from am + bm l + cm l^2 = k by the series in the small curvature cm / bm
+            t = (plane - am) * turn
+            t -= bend * t * t * (_f(1) - _f(2) * bend * t)
+            # length from plane to plane, here over its value 1 / bm at l = 0
+            crossed = (plane >= planes[ray]) & (plane < planes[LANES + ray])
+            share = _f(1) - _f(2) * bend * t if crossed else _f(0)
+            # a ray may be out of the volume in planes that only its neighbours cross, or by rounding
+            o = min(max(ao + t * (bo + t * co), _f(0)), most_o)
+            z = min(max(az + t * (bz + t * cz), _f(0)), most_z)
+            io, iz = np.int32(o), np.int32(z)
+            fo, slope_o = _in_phase(o - _f(io), phase)
+            fz, slope_z = _in_phase(z - _f(iz), phase)
+            # unsigned indices: signed ones of 32 bits were slower, and these reach twice as far
+            p = np.uint32(iz * stride_z + io * stride_o + at)
+            q = np.uint32(p + stride_z)
+            # the four voxels around the place in this plane, and the bilinear value with its exact derivatives
+            a00, a01 = volume[p], volume[np.uint32(p + stride_o)]
+            a10, a11 = volume[q], volume[np.uint32(q + stride_o)]
+            d0, d1 = a01 - a00, a11 - a10
+            low = a00 + fo * d0
+            dz = a10 + fo * d1 - low
+            value = share * (low + fz * dz)
+            do = share * slope_o * (d0 + fz * (d1 - d0))
+            dz *= share * slope_z
+            sums[ray] += value
+            sums[LANES + ray] += t * value
+            sums[2 * LANES + ray] += do
+            sums[5 * LANES + ray] += dz
+            do *= t
+            dz *= t
+            sums[3 * LANES + ray] += do
+            sums[6 * LANES + ray] += dz
+            sums[4 * LANES + ray] += t * do
+            sums[7 * LANES + ray] += t * dz
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _sum_values(volume, strides, limit, first, last, path, phase):  # type: ignore[no-untyped-def]
-    """Sum F over the planes first <= k < last that the ray crosses; arguments as of _sum_all."""
-    am, bm, cm, ao, bo, co, az, bz, cz = path
+@_each_ray(fastmath=True, boundscheck=False)
+def _sum_values(volume, strides, most, first, last, phase, path, planes, sums):  # type: ignore[no-untyped-def]
+    """Sum F alone over the planes that each ray crosses (ray,); arguments as of _sum_all."""
     stride_m, stride_o, stride_z = strides
-    most_o, most_z = limit
-    turn = _f(1) / bm
-    bend = cm * turn
-    v0 = _f(0)
+    most_o, most_z = most
+    sums[:] = _f(0)
     for k in range(first, last):
-        t = (_f(k) - am) * turn
-        t -= bend * t * t * (_f(1) - _f(2) * bend * t)
-        o = min(max(ao + t * (bo + t * co), _f(0)), most_o)
-        z = min(max(az + t * (bz + t * cz), _f(0)), most_z)
-        io, iz = np.int32(o), np.int32(z)
-        fo, fz = _in_phase(o - _f(io), phase)[0], _in_phase(z - _f(iz), phase)[0]
-        p = np.uint32(iz * stride_z + io * stride_o + np.uint32(k) * stride_m)
-        q = p + stride_z
-        a00, a01, a10, a11 = volume[p], volume[p + stride_o], volume[q], volume[q + stride_o]
-        low = a00 + fo * (a01 - a00)
-        v0 += (_f(1) - _f(2) * bend * t) * (low + fz * (a10 + fo * (a11 - a10) - low))
-    return v0
+        plane, at = _f(k), np.uint32(k) * stride_m
+        for ray in range(LANES):
+            am, turn, bend = path[ray], path[LANES + ray], path[2 * LANES + ray]
+            ao, bo, co = path[3 * LANES + ray], path[4 * LANES + ray], path[5 * LANES + ray]
+            az, bz, cz = path[6 * LANES + ray], path[7 * LANES + ray], path[8 * LANES + ray]
+            t = (plane - am) * turn
+            t -= bend * t * t * (_f(1) - _f(2) * bend * t)
+            crossed = (plane >= planes[ray]) & (plane < planes[LANES + ray])
+            share = _f(1) - _f(2) * bend * t if crossed else _f(0)
+            o = min(max(ao + t * (bo + t * co), _f(0)), most_o)
+            z = min(max(az + t * (bz + t * cz), _f(0)), most_z)
+            io, iz = np.int32(o), np.int32(z)
+            fo, fz = _in_phase(o - _f(io), phase)[0], _in_phase(z - _f(iz), phase)[0]
+            p = np.uint32(iz * stride_z + io * stride_o + at)
+            q = np.uint32(p + stride_z)
+            a00, a01 = volume[p], volume[np.uint32(p + stride_o)]
+            a10, a11 = volume[q], volume[np.uint32(q + stride_o)]
+            low = a00 + fo * (a01 - a00)
+            sums[ray] += share * (low + fz * (a10 + fo * (a11 - a10) - low))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _planes(path, a, b, count):  # type: ignore[no-untyped-def]
-    """Return the planes [first, last) that the ray crosses between a and b, each counted in one interval only."""
-    # half open, on the side of a: a plane exactly on a wall between two intervals belongs to the later one
-    start = path[0] + a * (path[1] + a * path[2])
-    end = path[0] + b * (path[1] + b * path[2])
-    if end >= start:
-        first, last = int(np.ceil(start)), int(np.ceil(end))
-    else:
-        first, last = int(np.floor(end)) + 1, int(np.floor(start)) + 1
-    return max(first, 0), min(last, count)
+@_each_ray()
+def _add_value(sums, turn, voxel_mm, value):  # type: ignore[no-untyped-def]
+    """Add the integrals of F, grey levels: from plane to plane a ray is |1 / x'_m| voxels long, and F is per mm."""
+    for ray in range(LANES):
+        value[ray] += sums[ray] * (voxel_mm * abs(turn[ray]))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _nine_sums(sums, path, along_x):  # type: ignore[no-untyped-def]
-    """Complete the sums of d_i F times 1, l, l^2, for i = x, y, z, by parts along the axis across the planes.
+@_each_ray()
+def _nine_sums(sums, turn, path, m, o, voxel_mm, nine):  # type: ignore[no-untyped-def]
+    """Write the integrals of d_i F times 1, l, l^2 (power, i, ray), by parts along the axis across the planes.
 
     Bilinear interpolation in a plane knows no derivative across it. What integration by parts leaves at the two ends
     of an interval is left out: F is zero at the ends of the ray, and at a section the motions of both intervals agree,
-    so that their ends cancel but for the change of slope there. The slope t is taken at l = 0.
+    so that their ends cancel but for the change of slope there. The slope is taken at l = 0.
     """
-    v0, v1 = sums[0], sums[1]
-    g0, g1, g2 = np.float64(sums[2]), np.float64(sums[3]), np.float64(sums[4])
-    h0, h1, h2 = np.float64(sums[5]), np.float64(sums[6]), np.float64(sums[7])
-    turn = 1.0 / path[1]
-    o, z = path[4] * turn, path[7] * turn
-    m0 = -o * g0 - z * h0
-    m1 = -o * g1 - z * h1 - turn * v0
-    m2 = -o * g2 - z * h2 - 2 * turn * v1
-    if along_x:
-        return m0, g0, h0, m1, g1, h1, m2, g2, h2
-    return g0, m0, h0, g1, m1, h1, g2, m2, h2
+    for ray in range(LANES):
+        inverse = turn[ray]
+        scale = voxel_mm * abs(inverse)
+        v0, v1 = sums[ray], sums[LANES + ray]
+        g0, g1, g2 = sums[2 * LANES + ray], sums[3 * LANES + ray], sums[4 * LANES + ray]
+        h0, h1, h2 = sums[5 * LANES + ray], sums[6 * LANES + ray], sums[7 * LANES + ray]
+        across, rise = path[3 * o + LANES + ray] * inverse, path[3 * _Z + LANES + ray] * inverse
+        nine[m + ray] = (-across * g0 - rise * h0) * scale
+        nine[3 * LANES + m + ray] = (-across * g1 - rise * h1 - inverse * v0) * scale
+        nine[6 * LANES + m + ray] = (-across * g2 - rise * h2 - 2 * inverse * v1) * scale
+        nine[o + ray] = g0 * scale
+        nine[3 * LANES + o + ray] = g1 * scale
+        nine[6 * LANES + o + ray] = g2 * scale
+        nine[_Z + ray] = h0 * scale
+        nine[3 * LANES + _Z + ray] = h1 * scale
+        nine[6 * LANES + _Z + ray] = h2 * scale
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _clip_box(box, base, along):  # type: ignore[no-untyped-def]
-    """Return the part [a, b] of the ray base + l along that lies in a box; empty where a >= b."""
-    a, b = -_BIG, _BIG
+@_each_ray(fastmath=True)
+def _twelve(nine, whole, sign, s0, s1, base, along, twelve):  # type: ignore[no-untyped-def]
+    """Write the integrals of w x_j d_i F and w d_i F (i, j, ray), with w = whole + sign s the share of a section."""
     for i in range(3):
-        # a ray along a face of the box never crosses it: it is between the two faces or it is not
-        if abs(along[i]) < 1e-12:
-            if base[i] < box[0, i] or base[i] > box[1, i]:
-                return 0.0, 0.0
-        else:
-            near, far = (box[0, i] - base[i]) / along[i], (box[1, i] - base[i]) / along[i]
-            a, b = max(a, min(near, far)), min(b, max(near, far))
-    return a, b
+        for ray in range(LANES):
+            m0, m1, m2 = nine[i * LANES + ray], nine[(3 + i) * LANES + ray], nine[(6 + i) * LANES + ray]
+            w0, w1 = whole + sign * s0[ray], sign * s1[ray]
+            flat, tilted = w0 * m0 + w1 * m1, w0 * m1 + w1 * m2
+            twelve[4 * LANES * i + ray] = flat * base[_X + ray] + tilted * along[_X + ray]
+            twelve[4 * LANES * i + LANES + ray] = flat * base[_Y + ray] + tilted * along[_Y + ray]
+            twelve[4 * LANES * i + 2 * LANES + ray] = flat * base[_Z + ray] + tilted * along[_Z + ray]
+            twelve[4 * LANES * i + 3 * LANES + ray] = flat
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _clip_hull(place, support, normals, limit, layers, a, b, path):  # type: ignore[no-untyped-def]
-    """Shrink [a, b] to where the moved ray x'(l), taken as straight between a and b, meets the hull.
+@_each_ray(fastmath=True)
+def _add_section(pattern, twelve, s, at):  # type: ignore[no-untyped-def]
+    """Add to s (unknown, ray) the integrals of w Psi(x(l)) . grad F, for the motions of a section from `at` on.
 
-    It also stays inside the volume's first and last layer but one: where the volume is cut in height, the step from
-    the sample to the empty outermost layer is no texture. Written without branches over the half-planes, in single
-    precision, so that they are clipped together; `limit` (direction,) is scratch.
+    Psi is affine in x and x is linear in l, so that the twelve integrals hold all that the section's motions need: a
+    motion more costs twelve products more.
     """
-    ax, bx, cx, ay, by, cy, az, bz, cz = path
-    xa, ya, za = _f(ax + a * (bx + a * cx)), _f(ay + a * (by + a * cy)), az + a * (bz + a * cz)
-    xb, yb, zb = _f(ax + b * (bx + b * cx)), _f(ay + b * (by + b * cy)), az + b * (bz + b * cz)
-    first = max(int(np.floor((min(za, zb) - place[0]) / place[1])), 0)
-    last = min(int(np.floor((max(za, zb) - place[0]) / place[1])), support.shape[0] - 1)
-    if first > last:
-        return a, a
-    # a ray through several slabs is clipped by the hull of them all
-    limit[:] = support[first]
-    for slab in range(first + 1, last + 1):
-        for k in range(len(limit)):
-            limit[k] = max(limit[k], support[slab, k])
-    low, high = _f(0), _f(1)
-    for da, db in ((za - 1, zb - 1), (layers - 2 - za, layers - 2 - zb)):
-        if da < 0 and db < 0:
-            return a, a
-        if da < 0:
-            low = max(low, _f(da / (da - db)))
-        elif db < 0:
-            high = min(high, _f(da / (da - db)))
-    for k in range(len(limit)):
-        # depths below the half-plane's edge at both ends; it is crossed where the line between them is zero
-        da = limit[k] - (normals[0, k] * xa + normals[1, k] * ya)
-        db = limit[k] - (normals[0, k] * xb + normals[1, k] * yb)
-        t = da / (da - db)
-        # outside at both ends: beyond 1, so that nothing is left
-        enter = _f(2) if db < 0 else t
-        low = max(low, enter if da < 0 else _f(0))
-        high = min(high, t if db < 0 else _f(1))
-    if low >= high:
-        return a, a
-    return a + low * (b - a), a + high * (b - a)
-
-
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
-def _quadratic_row(first, second, i, base, along, s0, s1):  # type: ignore[no-untyped-def]
-    """Return coordinate i of x'(l) = x - u(x), with u = (1 - s) u_first + s u_second, s = s0 + s1 l."""
-    # u of both sections along the ray: p + q l, and what the second has more, dp + dq l
-    p = first[i, 0] * base[0] + first[i, 1] * base[1] + first[i, 2] * base[2] + first[i, 3]
-    q = first[i, 0] * along[0] + first[i, 1] * along[1] + first[i, 2] * along[2]
-    dp = second[i, 0] * base[0] + second[i, 1] * base[1] + second[i, 2] * base[2] + second[i, 3] - p
-    dq = second[i, 0] * along[0] + second[i, 1] * along[1] + second[i, 2] * along[2] - q
-    return base[i] - p - s0 * dp, along[i] - q - s0 * dq - s1 * dp, -s1 * dq
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _quadratic(first, second, base, along, s0, s1):  # type: ignore[no-untyped-def]
-    """Return the nine coefficients of the moved ray x'(l), coordinate by coordinate."""
-    ax, bx, cx = _quadratic_row(first, second, 0, base, along, s0, s1)
-    ay, by, cy = _quadratic_row(first, second, 1, base, along, s0, s1)
-    az, bz, cz = _quadratic_row(first, second, 2, base, along, s0, s1)
-    return ax, bx, cx, ay, by, cy, az, bz, cz
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
-def _add_section(pattern, w0, w1, base, along, sums, scale, k, out):  # type: ignore[no-untyped-def]
-    """Add to `out` (motion,) the integral of (w0 + w1 l) Psi(x(l)) . grad F, from the nine sums; `k` is scratch.
-
-    Psi is affine in x and x is linear in l, so that twelve integrals, of x_j d_i F and d_i F, hold all that the
-    section's motions need: a motion more costs twelve products more.
-    """
-    for i in range(3):
-        m0, m1, m2 = sums[i], sums[3 + i], sums[6 + i]
-        flat, tilted = (w0 * m0 + w1 * m1) * scale, (w0 * m1 + w1 * m2) * scale
-        for j in range(3):
-            k[4 * i + j] = flat * base[j] + tilted * along[j]
-        k[4 * i + 3] = flat
-    for n in range(pattern.shape[0]):
-        total = 0.0
+    for motion in range(pattern.shape[0]):
         for i in range(12):
-            total += pattern[n, i] * k[i]
-        out[n] += total
+            # most are zero
+            if pattern[motion, i] == 0:
+                continue
+            for ray in range(LANES):
+                s[(at + motion) * LANES + ray] += pattern[motion, i] * twelve[i * LANES + ray]
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
-def _add_outer(matrix, vector, s, first, last, weight, rho):  # type: ignore[no-untyped-def]
-    """Add w s s^T (lower triangle) and w s rho of one pixel; the upper triangle is filled in once, at the end."""
+@_each_ray(fastmath=True)
+def _add_products(s, first, last, weight, weighted_rho, matrix, vector):  # type: ignore[no-untyped-def]
+    """Add w s s^T (lower triangle) and w s rho of all rays, of the unknowns first <= i < last.
+
+    `s` (unknown, ray), `weight` and `weighted_rho` (ray,). The upper triangle is filled in once, at the end.
+    """
     for i in range(first, last):
-        w = weight * s[i]
-        vector[i] += w * rho
+        total = 0.0
+        for ray in range(LANES):
+            total += s[i * LANES + ray] * weighted_rho[ray]
+        vector[i] += total
         for j in range(first, i + 1):
-            matrix[i, j] += w * s[j]
+            total = 0.0
+            for ray in range(LANES):
+                total += s[i * LANES + ray] * weight[ray] * s[j * LANES + ray]
+            matrix[i, j] += total
