@@ -23,6 +23,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from pdvc.apart import apart
 from pdvc.geometry import ConeBeam, gaps_rad
 from pdvc.progress import Progress, silent
 from pdvc.rays import directions
@@ -51,7 +52,7 @@ def fdk(
     `view(i)` returns radiograph i (row, column) in grey levels; several threads ask for theirs at once. Raises
     ValueError where the angles do not go all around.
     """
-    share = angular_share(angle_rad)
+    share = angular_share(angle_rad).astype(np.float32)
     level = replace(geometry, roll_rad=0.0)
     inside, first = _columns_inside(grid, hull)
     result = np.zeros((grid.shape[1], grid.shape[2], grid.shape[0]), dtype=np.float32)
@@ -59,7 +60,7 @@ def fdk(
     beam, across = directions(angle_rad)
 
     def filtered(i: int) -> Image:
-        return _filtered(_unrolled(view(i), geometry) * weight * share[i], ramp)
+        return _filtered(_unrolled(view(i), geometry) * (weight * share[i]), ramp)
 
     # a view is read and filtered by one thread
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
@@ -156,23 +157,30 @@ def _columns_inside(grid: Grid, hull: Hull) -> tuple[NDArray[np.bool_], NDArray[
     return inside, first
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
+@apart(fastmath=True, boundscheck=False)
 def _blend(one, two, f, first, last, out):  # type: ignore[no-untyped-def]
     """Interpolate between two detector columns, over the rows first <= r < last."""
     for r in range(first, last):
         out[r] = one[r] + f * (two[r] - one[r])
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
-def _add_slab(out, line, first, last, r0, dr, top, weight):  # type: ignore[no-untyped-def]
-    """Add what the voxels first <= k < last of a column see: row r0 + k dr of a detector column."""
-    for k in range(first, last):
-        # beyond the detector its edge goes on; a scan's grid is only as high as every view sees, to a voxel or so
-        r = min(max(r0 + np.float32(k) * dr, np.float32(0)), top)
-        # unsigned: numba need not ask whether an index counts from the end
-        i = np.uint32(r)
-        low = line[i]
-        out[k] += weight * (low + (r - np.float32(i)) * (line[i + np.uint32(1)] - low))
+@apart(fastmath=True, boundscheck=False)
+def _add_column(out, line, inside, first, r0, dr, top, weight):  # type: ignore[no-untyped-def]
+    """Add what the voxels of a column's slabs inside see: voxel k row r0 + k dr of a detector column."""
+    slab = 0
+    while slab < len(inside):
+        # slabs that follow each other are one piece of the column
+        start = slab
+        while slab < len(inside) and inside[slab]:
+            slab += 1
+        for k in range(first[start], first[slab]):
+            # beyond the detector its edge goes on; a scan's grid is only as high as every view sees, to a voxel or so
+            r = min(max(r0 + np.float32(k) * dr, np.float32(0)), top)
+            # unsigned: numba need not ask whether an index counts from the end
+            i = np.uint32(r)
+            low = line[i]
+            out[k] += weight * (low + (r - np.float32(i)) * (line[i + np.uint32(1)] - low))
+        slab += 1
 
 
 @njit(nogil=True, cache=True, error_model="numpy", parallel=True)
@@ -219,15 +227,5 @@ def _back_project(out, views, beam, across, origin, voxel, distances, shift, ins
                     r_from, r_to = 0, rows
                 _blend(views[n, c], views[n, c + 1], np.float32(u - c), r_from, r_to, line)
                 weight = np.float32((source / depth) ** 2)
-                for slab in range(inside.shape[2]):
-                    if inside[j, i, slab]:
-                        _add_slab(
-                            out[j, i],
-                            line,
-                            first[slab],
-                            first[slab + 1],
-                            np.float32(r0),
-                            np.float32(dr),
-                            np.float32(rows - 1.001),
-                            weight,
-                        )
+                top = np.float32(rows - 1.001)
+                _add_column(out[j, i], line, inside[j, i], first, np.float32(r0), np.float32(dr), top, weight)

@@ -111,8 +111,14 @@ def overlaid(fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]], sha
 def _blank(
     low: NDArray[np.int64], high: NDArray[np.int64], shape: tuple[int, ...], motions: int
 ) -> tuple[NDArray[np.int64], Image]:
-    """Return the first section of each row, and zeros for the sections from `low` to `high` (row,), 0 for none."""
-    low = np.where(high > 0, low, 0)
+    """Return the first section of each row, and zeros for the sections from `low` to `high` (row,), 0 for none.
+
+    A row without any begins where its neighbours do: one from far below would make room for all in between.
+    """
+    filled = np.flatnonzero(high > 0)
+    if len(filled) == 0:
+        return np.zeros_like(low), np.zeros((*shape, motions), dtype=np.float32)
+    low = low[filled[np.abs(np.arange(len(low))[:, None] - filled).argmin(axis=1)]]
     return low, np.zeros((*shape, max(int((high - low).max()), 1) * motions), dtype=np.float32)
 
 
@@ -163,15 +169,14 @@ def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
     rows, columns = out.shape[0], out.shape[1]
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
-            # most carry something only inside the sample
-            empty = True
+            # a pixel carries what is of the sections that its ray meets, two or three of those of its row
+            low, high = values.shape[2], 0
             for k in range(values.shape[2]):
                 if values[row, column, k] != 0:
-                    empty = False
-                    break
+                    low, high = min(low, k), k + 1
             r, c, longer = places[row, column]
             i, j = first_pixel(r, rows), first_pixel(c, columns)
-            if empty or i < 0 or j < 0:
+            if low >= high or i < 0 or j < 0:
                 continue
             down, right = keys_weights(r - i), keys_weights(c - j)
             for m in range(4):
@@ -182,7 +187,7 @@ def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
                     share = np.float32(longer * down[m] * right[n])
                     if share != 0:
                         to = out[to_row, min(max(j - 1 + n, 0), columns - 1)]
-                        for k in range(values.shape[2]):
+                        for k in range(low, high):
                             to[start + k] += share * values[row, column, k]
 
 

@@ -29,9 +29,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
-from numba.core.compiler import Compiler
 from numpy.typing import NDArray
 
+from pdvc.apart import apart
 from pdvc.volume import Hull
 
 Floats = NDArray[np.float64]
@@ -50,26 +50,6 @@ _BIG = 1e30
 _LEAST_SLOPE = 1e-12
 _X, _Y, _Z = 0, LANES, 2 * LANES
 _NORMALS32 = np.ascontiguousarray(Hull.normals().T, dtype=np.float32)
-
-
-class _Apart(Compiler):  # type: ignore[misc]
-    """Compile in the knowledge that arrays given to a function do not overlap.
-
-    What is written can then not be what is read, and loops over rays become vectors of rays.
-    """
-
-    def define_pipelines(self):  # type: ignore[no-untyped-def]
-        """Return numba's own passes."""
-        self.state.flags.noalias = True
-        return super().define_pipelines()
-
-
-def _each_ray(**options):  # type: ignore[no-untyped-def]
-    """Return the decorator of a kernel that does one thing for each ray of a block: of arrays that do not overlap.
-
-    An array of such a kernel holds one component after the other, each of `LANES` rays.
-    """
-    return njit(nogil=True, cache=True, error_model="numpy", pipeline_class=_Apart, **options)
 
 
 class Scene(NamedTuple):
@@ -236,7 +216,7 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
                 s[first * LANES : last * LANES] = 0.0
 
 
-@_each_ray()
+@apart()
 def _aim(rays, middle, row, column0, base, along, reach):  # type: ignore[no-untyped-def]
     """Write the rays base + l along to pixels' centres, along of length 1, and the distances base - source.
 
@@ -257,7 +237,7 @@ def _aim(rays, middle, row, column0, base, along, reach):  # type: ignore[no-unt
         reach[ray] = away
 
 
-@_each_ray()
+@apart()
 def _clip_box(box, base, along, reach, count, enter, leave):  # type: ignore[no-untyped-def]
     """Write the parts [enter, leave] of the rays that lie in a box; empty where enter >= leave, as beyond `count`."""
     for ray in range(LANES):
@@ -293,7 +273,7 @@ def _heights_met(base, along, enter, leave):  # type: ignore[no-untyped-def]
     return low - 1e-6, high + 1e-6
 
 
-@_each_ray()
+@apart()
 def _between(bottom, top, base, along, enter, leave, a, b):  # type: ignore[no-untyped-def]
     """Write the parts [a, b] of the rays between two heights; both zero where there is none.
 
@@ -307,7 +287,7 @@ def _between(bottom, top, base, along, enter, leave, a, b):  # type: ignore[no-u
         b[ray] = end if start < end else 0.0
 
 
-@_each_ray()
+@apart()
 def _share(bottom, per_gap, base, along, s0, s1):  # type: ignore[no-untyped-def]
     """Write the upper section's share along the rays, s0 + s1 l; `per_gap` is 1 / (top - bottom), 0 for one alone."""
     for ray in range(LANES):
@@ -315,7 +295,7 @@ def _share(bottom, per_gap, base, along, s0, s1):  # type: ignore[no-untyped-def
         s1[ray] = along[_Z + ray] * per_gap
 
 
-@_each_ray()
+@apart()
 def _path(first, second, s0, s1, base, along, path):  # type: ignore[no-untyped-def]
     """Write the coefficients of the moved rays x'(l) = x - u(x), u = (1 - s) u_first + s u_second.
 
@@ -335,7 +315,7 @@ def _path(first, second, s0, s1, base, along, path):  # type: ignore[no-untyped-
             path[3 * LANES * i + 2 * LANES + ray] = -s1[ray] * dq
 
 
-@_each_ray()
+@apart()
 def _ends(path, a, b, ends):  # type: ignore[no-untyped-def]
     """Write x', y', z' at a, then at b (end, coordinate, ray)."""
     for i in range(3):
@@ -370,7 +350,7 @@ def _limits(place, support, a, b, ends, limit):  # type: ignore[no-untyped-def]
     return True
 
 
-@_each_ray(fastmath=True, boundscheck=False)
+@apart(fastmath=True, boundscheck=False)
 def _clip_hull(normals, limit, layers, ends, a, b, low, high, inner_a, inner_b):  # type: ignore[no-untyped-def]
     """Shrink [a, b] to where the moved rays, taken as straight between a and b, meet a hull; to nothing elsewhere.
 
@@ -409,7 +389,7 @@ def _left_above(da, db):  # type: ignore[no-untyped-def]
     return enter if da < 0 else _f(0), t if db < 0 else _f(1)
 
 
-@_each_ray()
+@apart()
 def _planes(path, m, o, along, a, b, count, planes, turn, path32):  # type: ignore[no-untyped-def]
     """Write the planes [first, last) across the axis m that the rays cross between a and b: (end, ray).
 
@@ -455,7 +435,7 @@ def _in_phase(f, phase):  # type: ignore[no-untyped-def]
     return f + phase * away * (_f(1) - _f(2) * f), _f(1) + phase * (_f(1) - _f(6) * away)
 
 
-@_each_ray(fastmath=True, boundscheck=False)
+@apart(fastmath=True, boundscheck=False)
 def _sum_all(volume, strides, most, first, last, phase, path, planes, sums):  # type: ignore[no-untyped-def]
     """Sum F times 1, l, and d_o F times 1, l, l^2, over the planes that each ray crosses: (sum, ray).
 
@@ -508,7 +488,7 @@ def _sum_all(volume, strides, most, first, last, phase, path, planes, sums):  # 
             sums[7 * LANES + ray] += t * dz
 
 
-@_each_ray(fastmath=True, boundscheck=False)
+@apart(fastmath=True, boundscheck=False)
 def _sum_values(volume, strides, most, first, last, phase, path, planes, sums):  # type: ignore[no-untyped-def]
     """Sum F alone over the planes that each ray crosses (ray,); arguments as of _sum_all."""
     stride_m, stride_o, stride_z = strides
@@ -536,14 +516,14 @@ def _sum_values(volume, strides, most, first, last, phase, path, planes, sums): 
             sums[ray] += share * (low + fz * (a10 + fo * (a11 - a10) - low))
 
 
-@_each_ray()
+@apart()
 def _add_value(sums, turn, voxel_mm, value):  # type: ignore[no-untyped-def]
     """Add the integrals of F, grey levels: from plane to plane a ray is |1 / x'_m| voxels long, and F is per mm."""
     for ray in range(LANES):
         value[ray] += sums[ray] * (voxel_mm * abs(turn[ray]))
 
 
-@_each_ray()
+@apart()
 def _nine_sums(sums, turn, path, m, o, voxel_mm, nine):  # type: ignore[no-untyped-def]
     """Write the integrals of d_i F times 1, l, l^2 (power, i, ray), by parts along the axis across the planes.
 
@@ -569,7 +549,7 @@ def _nine_sums(sums, turn, path, m, o, voxel_mm, nine):  # type: ignore[no-untyp
         nine[6 * LANES + _Z + ray] = h2 * scale
 
 
-@_each_ray(fastmath=True)
+@apart(fastmath=True)
 def _twelve(nine, whole, sign, s0, s1, base, along, twelve):  # type: ignore[no-untyped-def]
     """Write the integrals of w x_j d_i F and w d_i F (i, j, ray), with w = whole + sign s the share of a section."""
     for i in range(3):
@@ -583,7 +563,7 @@ def _twelve(nine, whole, sign, s0, s1, base, along, twelve):  # type: ignore[no-
             twelve[4 * LANES * i + 3 * LANES + ray] = flat
 
 
-@_each_ray(fastmath=True)
+@apart(fastmath=True)
 def _add_section(pattern, twelve, s, at):  # type: ignore[no-untyped-def]
     """Add to s (unknown, ray) the integrals of w Psi(x(l)) . grad F, for the motions of a section from `at` on.
 
@@ -599,7 +579,7 @@ def _add_section(pattern, twelve, s, at):  # type: ignore[no-untyped-def]
                 s[(at + motion) * LANES + ray] += pattern[motion, i] * twelve[i * LANES + ray]
 
 
-@_each_ray(fastmath=True)
+@apart(fastmath=True)
 def _add_products(s, first, last, weight, weighted_rho, matrix, vector):  # type: ignore[no-untyped-def]
     """Add w s s^T (lower triangle) and w s rho of all rays, of the unknowns first <= i < last.
 

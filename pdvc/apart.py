@@ -1,0 +1,30 @@
+"""Kernels whose arrays do not overlap, and are known not to.
+
+A loop that reads one array at places it works out itself, and writes to another, becomes vectors only if what it
+writes cannot be what it reads next. Numba does not say so of the arrays that a function is given, but can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import njit
+from numba.core.compiler import Compiler
+
+
+class _Apart(Compiler):  # type: ignore[misc]
+    """Numba's own passes, in the knowledge that arrays given to the function do not overlap."""
+
+    def define_pipelines(self):  # type: ignore[no-untyped-def]
+        """Return numba's own passes."""
+        self.state.flags.noalias = True
+        return super().define_pipelines()
+
+
+def apart(**options: Any) -> Callable[..., Any]:
+    """Return the decorator of a kernel that is called by kernels alone, with arrays that do not overlap.
+
+    `options` are numba's, beside those that all kernels have.
+    """
+    return njit(nogil=True, cache=True, error_model="numpy", pipeline_class=_Apart, **options)  # type: ignore[no-any-return]
