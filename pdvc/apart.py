@@ -23,7 +23,7 @@ class _Apart(Compiler):  # type: ignore[misc]
 
 
 def apart(**options: Any) -> Callable[..., Any]:
-    """Return the decorator of a kernel that is called by kernels alone, with arrays that do not overlap.
+    """Return the decorator of a kernel that writes to no array that overlaps another one it is given.
 
     `options` are numba's, beside those that all kernels have.
     """

@@ -50,8 +50,6 @@ SOURCES = ("radiographs", "views", "flats")
 BELIEF = 0.1
 """Share of e that it may be wrong by, alike everywhere: what re-projection leaves of paths a little other than those
 of the reference scan is known no better."""
-_STEPS_AT_ONCE = 4
-"""Fewer than in a pass: the sensitivities of each are kept, in the window and over the detector."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,10 +165,12 @@ def propagate(
 
     company = _company(sight, apart)
     order = list(company)
-    # rays are walked by all threads at once; what follows is one thread's work for each step
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
-        for done in range(0, len(order), _STEPS_AT_ONCE):
-            steps = order[done : done + _STEPS_AT_ONCE]
+    # rays are walked by all threads at once; what follows is one thread's work for each step. No more steps at a time
+    # than threads: the sensitivities of each are kept, in the window and over the detector
+    at_once = numba.get_num_threads()
+    with ThreadPoolExecutor(at_once) as pool:
+        for done in range(0, len(order), at_once):
+            steps = order[done : done + at_once]
             fields = _weighted(images, basis, amplitude, steps)
             left = [_registered(images, basis, amplitude, t) for t in steps]
             for t, (moved, shared) in zip(steps, pool.map(add_step, steps, fields, left), strict=True):

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import reduce
+
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,92 +34,119 @@ def residual_tests(
 
     At amplitudes (step, section, motion), voxels; `unknowns` of all steps were found.
     """
-    tests = _Tests(noise_overlap(noise.smooth_px))
+    overlap = noise_overlap(noise.smooth_px)
     sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
-    for t, rays in enumerate(images.rays):
-        places = systematic.places(t, rays, basis, amplitude[t], images.voxel_mm)
+
+    def of_step(t: int) -> _Sums:
+        places = systematic.places(t, images.rays[t], basis, amplitude[t], images.voxel_mm)
         used, view = images.weight[t % len(images.weight)] > 0, mean_of_views(noise, sight.of_step(t))
-        tests.add(residual[t], used, noise.step(t), view, noise.flat, places, systematic.corner)
-    return tests.result(unknowns)
+        return _sums(overlap, residual[t], used, noise.step(t), view, noise.flat, places, systematic.corner)
+
+    # a step is one thread's work; sums are added in order, whichever is ready first
+    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+        total = reduce(_Sums.__add__, pool.map(of_step, range(len(residual))))
+    return total.result(unknowns)
 
 
-class _Tests:
-    """The sums that tell whether the residual is the noise that is expected."""
+@dataclass(frozen=True, kw_only=True)
+class _Sums:
+    """The sums over pixels that tell whether a residual is the noise that is expected."""
 
-    def __init__(self, overlap: Floats) -> None:
-        self._overlap = overlap
-        self._chi2, self._pixels = 0.0, 0
-        self._seen, self._expected, self._pairs = np.zeros(2), np.zeros(2), np.zeros(2)
+    chi2: float
+    pixels: int
+    seen: Floats
+    """Products of neighbours down and across (2,), each over its standard deviation."""
+    expected: Floats
+    """What noise makes of them (2,)."""
+    pairs: Floats
+    """Number of neighbours (2,)."""
 
-    def add(
-        self,
-        residual: Image,
-        used: NDArray[np.bool_],
-        image: ImageNoise,
-        view: ImageNoise,
-        flat: Image,
-        places: Floats,
-        corner: tuple[int, int],
-    ) -> None:
-        """Add a step: its radiograph's noise over the window, its views' and the flats' over the detector.
-
-        Noise varies little from pixel to pixel, so that it is taken from the pixel above and left of a place.
-        """
-        c = self._overlap
-        at = [np.clip(places[..., k].astype(int), 0, flat.shape[k] - 2) for k in range(2)]
-        weights = [taps(places[..., k], at[k]) for k in range(2)]
-
-        def lagged(tap: Floats, lag: int) -> Floats:
-            """Return the covariance along an axis of what is interpolated so, with the same `lag` pixels on."""
-            between = np.array([[_of_lag(c, m + lag - n) for n in range(4)] for m in range(4)])
-            return np.asarray(np.einsum("m...,mn,n...->...", tap, between, tap, optimize=True))
-
-        same, following = [lagged(each, 0) for each in weights], [lagged(each, 1) for each in weights]
-        pixel = np.indices(residual.shape) + np.array(corner)[:, None, None]
-
-        def flats(shift: int) -> list[Floats]:
-            """Return the covariance of a pixel with its place, moved by a shift, along each axis."""
-            return [
-                np.asarray(
-                    sum(weights[k][m] * _of_lag(c, at[k] - 1 + m + shift - pixel[k]) for m in range(4)), dtype=float
-                )
-                for k in range(2)
-            ]
-
-        (down, across), before, after = flats(0), flats(-1), flats(1)
-        here = flat[pixel[0], pixel[1]]
-        there, slope = flat[at[0], at[1]], view.slope[at[0], at[1]]
-        known = image.variance + image.slope**2 * here
-        moved = view.variance[at[0], at[1]] + slope**2 * there
-        # the flats are the same in both
-        twice = 2 * image.slope * slope * np.sqrt(here * there)
-        variance = c[0] ** 2 * known + same[0] * same[1] * moved - twice * down * across
-        white = np.where(used, residual / np.sqrt(variance), 0)
-        self._chi2 += float((white**2).sum())
-        self._pixels += int(used.sum())
-        shared = (
-            c[1] * c[0] * known + following[0] * same[1] * moved - twice * (before[0] + after[0]) / 2 * across,
-            c[0] * c[1] * known + same[0] * following[1] * moved - twice * down * (before[1] + after[1]) / 2,
+    def __add__(self, other: _Sums) -> _Sums:
+        """Return the sums over both."""
+        return _Sums(
+            chi2=self.chi2 + other.chi2,
+            pixels=self.pixels + other.pixels,
+            seen=self.seen + other.seen,
+            expected=self.expected + other.expected,
+            pairs=self.pairs + other.pairs,
         )
-        for axis in range(2):
-            first, second = [slice(None)] * 2, [slice(None)] * 2
-            first[axis], second[axis] = slice(None, -1), slice(1, None)
-            pairs = used[tuple(first)] & used[tuple(second)]
-            self._seen[axis] += float((white[tuple(first)] * white[tuple(second)]).sum())
-            self._expected[axis] += float((shared[axis] / variance)[tuple(first)][pairs].sum())
-            self._pairs[axis] += int(pairs.sum())
 
     def result(self, unknowns: int) -> ResidualTests:
         """Return the tests, of a solution with so many unknowns."""
-        pairs, mean_square = np.maximum(self._pairs, 1), max(self._chi2 / max(self._pixels, 1), 1e-300)
-        seen, expected = self._seen / pairs / mean_square, self._expected / pairs
+        pairs, mean_square = np.maximum(self.pairs, 1), max(self.chi2 / max(self.pixels, 1), 1e-300)
+        seen, expected = self.seen / pairs / mean_square, self.expected / pairs
         return ResidualTests(
-            chi2_reduced=self._chi2 / max(self._pixels - unknowns, 1),
+            chi2_reduced=self.chi2 / max(self.pixels - unknowns, 1),
             lag1_row=float(seen[0]),
             lag1_column=float(seen[1]),
             lag1_row_expected=float(expected[0]),
             lag1_column_expected=float(expected[1]),
         )
+
+
+def _sums(
+    overlap: Floats,
+    residual: Image,
+    used: NDArray[np.bool_],
+    image: ImageNoise,
+    view: ImageNoise,
+    flat: Image,
+    places: Floats,
+    corner: tuple[int, int],
+) -> _Sums:
+    """Return the sums of a step: its radiograph's noise over the window, its views' and the flats' over the detector.
+
+    Noise varies little from pixel to pixel, so that it is taken from the pixel above and left of a place.
+    """
+    at = [np.clip(places[..., k].astype(int), 0, flat.shape[k] - 2) for k in range(2)]
+    weights = [taps(places[..., k], at[k]) for k in range(2)]
+
+    same, following = ([_lagged(overlap, each, lag) for each in weights] for lag in (0, 1))
+    pixel = np.indices(residual.shape) + np.array(corner)[:, None, None]
+
+    def flats(shift: int) -> list[Floats]:
+        """Return the covariance of a pixel with its place, moved by a shift, along each axis."""
+        return [
+            np.asarray(
+                sum(weights[k][m] * _of_lag(overlap, at[k] - 1 + m + shift - pixel[k]) for m in range(4)), dtype=float
+            )
+            for k in range(2)
+        ]
+
+    (down, across), before, after = flats(0), flats(-1), flats(1)
+    here = flat[pixel[0], pixel[1]]
+    there, slope = flat[at[0], at[1]], view.slope[at[0], at[1]]
+    known = image.variance + image.slope**2 * here
+    moved = view.variance[at[0], at[1]] + slope**2 * there
+    # the flats are the same in both
+    twice = 2 * image.slope * slope * np.sqrt(here * there)
+    variance = overlap[0] ** 2 * known + same[0] * same[1] * moved - twice * down * across
+    white = np.where(used, residual / np.sqrt(variance), 0)
+    shared = (
+        overlap[1] * overlap[0] * known + following[0] * same[1] * moved - twice * (before[0] + after[0]) / 2 * across,
+        overlap[0] * overlap[1] * known + same[0] * following[1] * moved - twice * down * (before[1] + after[1]) / 2,
+    )
+    seen, expected, pairs = np.zeros(2), np.zeros(2), np.zeros(2)
+    for axis in range(2):
+        first, second = [slice(None)] * 2, [slice(None)] * 2
+        first[axis], second[axis] = slice(None, -1), slice(1, None)
+        both = used[tuple(first)] & used[tuple(second)]
+        seen[axis] = float((white[tuple(first)] * white[tuple(second)]).sum())
+        expected[axis] = float((shared[axis] / variance)[tuple(first)][both].sum())
+        pairs[axis] = int(both.sum())
+
+    return _Sums(chi2=float((white**2).sum()), pixels=int(used.sum()), seen=seen, expected=expected, pairs=pairs)
+
+
+def _lagged(overlap: Floats, tap: Floats, lag: int) -> Floats:
+    """Return the covariance along an axis of what four taps (4, ...) make of noise, with the same `lag` pixels on."""
+    total = np.zeros(tap.shape[1:])
+    for apart in range(4):
+        # of pixels `apart` from each other, each before and after the other
+        product = (tap[: 4 - apart] * tap[apart:]).sum(axis=0)
+        lags = {lag + apart, lag - apart}
+        total += sum(float(_of_lag(overlap, each)) for each in lags) * product
+    return total
 
 
 def _of_lag(overlap: Floats, lag: NDArray[np.int64] | int) -> Floats:

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pdvc.apart import apart
 from pdvc.projection import Sensitivities
 from pdvc.systematic import first_pixel, keys_weights
 
@@ -86,6 +87,8 @@ class Pile:
         for block, z in sorted(self._blocks.items()):
             rows = slice(block * _BLOCK_ROWS, min((block + 1) * _BLOCK_ROWS, self._shape[0]))
             flat = (z[: rows.stop - rows.start] * np.sqrt(variance[rows])[..., None, None]).reshape(-1, z[0, 0].size)
+            # pixels in air are left out
+            flat = flat[flat.any(axis=1)]
             product = (flat.T @ flat).reshape(functions, z.shape[3], functions, z.shape[3])
             i = self._first[block] * self._motions
             size = min(z.shape[3], unknowns - i)
@@ -136,7 +139,18 @@ def spread(field: Sensitivities, places: Floats, shape: tuple[int, ...]) -> Sens
     return Sensitivities(values=values, first=low, motions=field.motions)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _filled(values):  # type: ignore[no-untyped-def]
+    """Return the range of a pixel's values that are not zero: of the sections that its ray meets, few of its row's."""
+    low, high = 0, len(values)
+    while low < high and values[low] == 0:
+        low += 1
+    while high > low and values[high - 1] == 0:
+        high -= 1
+    return low, high
+
+
+@apart(fastmath=True, boundscheck=False)
 def _add_product(one, first, other, second, variance, out):  # type: ignore[no-untyped-def]
     """Add v one^T other of each pixel to `out`; `first` and `second` (row,) are where a row's values belong there.
 
@@ -160,7 +174,7 @@ def _add_product(one, first, other, second, variance, out):  # type: ignore[no-u
                 out[i0 + i, j0 + j] += part[i, j]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@apart()
 def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
     """Add each pixel's values to the 4 x 4 pixels that it was interpolated from; the adjoint of `systematic._cubic`.
 
@@ -169,11 +183,7 @@ def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
     rows, columns = out.shape[0], out.shape[1]
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
-            # a pixel carries what is of the sections that its ray meets, two or three of those of its row
-            low, high = values.shape[2], 0
-            for k in range(values.shape[2]):
-                if values[row, column, k] != 0:
-                    low, high = min(low, k), k + 1
+            low, high = _filled(values[row, column])
             r, c, longer = places[row, column]
             i, j = first_pixel(r, rows), first_pixel(c, columns)
             if low >= high or i < 0 or j < 0:
@@ -191,33 +201,27 @@ def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
                             to[start + k] += share * values[row, column, k]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@apart()
 def _add_to(out, values, offset, factor, row0, column0):  # type: ignore[no-untyped-def]
     """Add factor(p) values(p, k) to out, which starts row0 and column0 earlier, `offset` (row,) entries on."""
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
             scale = factor[row, column]
-            for k in range(values.shape[2]):
-                # room beyond the last section is empty
-                if values[row, column, k] != 0:
-                    out[row0 + row, column0 + column, offset[row] + k] += scale * values[row, column, k]
+            low, high = _filled(values[row, column])
+            to = out[row0 + row, column0 + column]
+            for k in range(low, high):
+                to[offset[row] + k] += scale * values[row, column, k]
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, boundscheck=False)
+@apart(fastmath=True, boundscheck=False)
 def _pile_up(z, values, offset, sigma):  # type: ignore[no-untyped-def]
     """Add sigma_f values(p, k) to z (row, column, f, k)."""
-    size = values.shape[2]
     for row in range(values.shape[0]):
         # unsigned: numba need not ask whether an index counts from the end
         start = np.uint32(offset[row])
         for column in range(values.shape[1]):
-            # pixels in air are left out
-            largest = np.float32(0)
-            for k in range(size):
-                largest = max(largest, abs(values[row, column, k]))
-            if largest == 0:
-                continue
+            low, high = _filled(values[row, column])
             for f in range(len(sigma)):
                 out = z[row, column, f]
-                for k in range(size):
+                for k in range(low, high):
                     out[start + np.uint32(k)] += sigma[f] * values[row, column, k]

@@ -225,10 +225,11 @@ def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column):  # type: ignore[no-untyped-def]
+def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column, k):  # type: ignore[no-untyped-def]
     """Return the row and the column, on the whole detector, where a pixel's material was seen before it moved.
 
-    And how many times as long a piece of it is along the ray as before, by which the path through it grew.
+    And how many times as long a piece of it is along the ray as before, by which the path through it grew; and the
+    section below, looked for from section k on.
     """
     n = len(heights)
     sx, sy, sz = rays[0]
@@ -242,7 +243,8 @@ def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column
     length = np.sqrt(x * x + y * y + z * z)
     bx, by, bz = x / length, y / length, z / length
     x, y, z = sx + at * x, sy + at * y, sz + at * z
-    k = 0
+    while k > 0 and heights[k] >= z:
+        k -= 1
     while k + 2 < n and heights[k + 1] < z:
         k += 1
     ux, uy, uz = _moved(maps[k], 0, x, y, z), _moved(maps[k], 1, x, y, z), _moved(maps[k], 2, x, y, z)
@@ -264,7 +266,7 @@ def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column
     scale = depth / (x * normal[0] + y * normal[1] + z * normal[2])
     x, y, z = sx + scale * x - ox, sy + scale * y - oy, sz + scale * z - oz
     row, column = (x * dx + y * dy + z * dz) / pitch2 + corner[0], (x * rx + y * ry + z * rz) / pitch2 + corner[1]
-    return row, column, longer
+    return row, column, longer, k
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -283,8 +285,9 @@ def _register(field, rays, delta, heights, maps, corner, out):  # type: ignore[n
     normal, depth, pitch2 = _panel(rays)
     turn = np.cos(delta), np.sin(delta)
     for row in prange(out.shape[0]):
+        k = 0
         for column in range(out.shape[1]):
-            r, c, longer = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)
+            r, c, longer, k = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column, k)
             out[row, column] = longer * _cubic(field, r, c)
 
 
@@ -293,6 +296,8 @@ def _find_places(rays, delta, heights, maps, corner, out):  # type: ignore[no-un
     """Write the places of all pixels of one step."""
     normal, depth, pitch2 = _panel(rays)
     turn = np.cos(delta), np.sin(delta)
+    k = 0
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
-            out[row, column] = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column)
+            r, c, longer, k = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column, k)
+            out[row, column] = r, c, longer
