@@ -19,6 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.banded import inverse_of
+
 Floats = NDArray[np.float64]
 
 
@@ -65,8 +67,7 @@ def reduced(information: Floats, vector: Floats, variance: Floats) -> Reduced:
     diagonal = np.arange(scaled.shape[1])
     scaled[:, diagonal, diagonal] += 1
     lower = np.linalg.cholesky(scaled)
-    half = np.linalg.inv(lower) * deviation[:, None]
-    covariance = half.transpose(0, 2, 1) @ half
+    covariance = np.stack([inverse_of(each) for each in lower]) * deviation[:, :, None] * deviation[:, None]
     gain = covariance @ information
     left = information - information @ gain
     mean = np.einsum("tmn,tn->tm", covariance, vector)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 Floats = NDArray[np.float64]
 
@@ -95,7 +96,7 @@ def factored(matrix: Blocks) -> Factor:
             here = here - far[t - 2] @ far[t - 2].T
         lower = np.linalg.cholesky(here)
         log_determinant += 2 * float(np.log(np.diag(lower)).sum())
-        inverse[t] = _inverse_of_lower(lower)
+        inverse[t] = inverse_of_lower(lower)
         if t + 1 < steps:
             following = matrix.next[t]
             if t >= 1:
@@ -106,17 +107,12 @@ def factored(matrix: Blocks) -> Factor:
     return Factor(inverse=inverse, next=near, after=far, log_determinant=log_determinant)
 
 
-_LEAF = 24
+def inverse_of_lower(lower: Floats) -> Floats:
+    """Return the inverse of a lower triangle of no zero on its diagonal."""
+    return np.asarray(lapack.dtrtri(lower.T, lower=0)[0].T)
 
 
-def _inverse_of_lower(lower: Floats) -> Floats:
-    """Return the inverse of a lower triangle, by halves: nearly all of it are products, which are fast."""
-    size = len(lower)
-    if size <= _LEAF:
-        return np.asarray(np.linalg.inv(lower))
-    half = size // 2
-    result = np.zeros_like(lower)
-    result[:half, :half] = _inverse_of_lower(lower[:half, :half])
-    result[half:, half:] = _inverse_of_lower(lower[half:, half:])
-    result[half:, :half] = -result[half:, half:] @ (lower[half:, :half] @ result[:half, :half])
-    return result
+def inverse_of(lower: Floats) -> Floats:
+    """Return (L L^T)^-1 of a lower triangle L of no zero on its diagonal."""
+    upper, _ = lapack.dpotri(lower.T, lower=0)
+    return np.asarray(np.triu(upper) + np.triu(upper, 1).T)

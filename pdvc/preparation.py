@@ -32,7 +32,7 @@ from pdvc.radiographs import (
     snr_db,
 )
 from pdvc.rays import ray_vectors
-from pdvc.reconstruction import fdk
+from pdvc.reconstruction import fdk, one_of
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, set_up
 from pdvc.store import Keep
@@ -165,16 +165,20 @@ def scan_volume(
     keep: Keep,
     progress: Progress,
 ) -> Volume:
-    """Reconstruct a full scan at a scale, inside a hull; `geometry` is that of scale 1."""
+    """Reconstruct a full scan at a scale, inside a hull; `geometry` is that of scale 1.
+
+    At scale n one of n / 2 views is used: for pixels n times as large they are twice as close as at scale 1.
+    """
     view, geometry = _viewer(series, calibration, scale, care.smooth_px), geometry.binned(scale)
-    grid = scan_grid(geometry, hull)
+    grid, chosen = scan_grid(geometry, hull), one_of(series.angle_rad, scale // 2)
 
     def seen(i: int) -> Image:
-        return sharpened(view(i)) if care.sharpen else view(i)
+        image = view(int(chosen[i]))
+        return sharpened(image) if care.sharpen else image
 
     def reconstructed() -> dict[str, NDArray[np.float32]]:
         task = f"reconstruct {geometry.voxel_mm * 1e3:.1f} um"
-        return {"F": fdk(seen, geometry, series.angle_rad, grid, hull, progress=progress, task=task)}
+        return {"F": fdk(seen, geometry, series.angle_rad[chosen], grid, hull, progress=progress, task=task)}
 
     values = keep(reconstructed)["F"]
     reached = hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm)

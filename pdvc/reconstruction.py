@@ -99,6 +99,19 @@ def angular_share(angle_rad: Floats) -> Floats:
     return np.asarray(part[inverse] / 2)
 
 
+def one_of(angle_rad: Floats, most: int) -> NDArray[np.int64]:
+    """Return one of every `most` views, evenly spread over the turn; of fewer where these would leave a gap.
+
+    Views are told by their places in `angle_rad`, in rising order.
+    """
+    order = np.argsort(np.mod(angle_rad, 2 * np.pi), kind="stable")
+    for stride in range(most, 1, -1):
+        chosen = np.sort(order[::stride])
+        if gaps_rad(np.sort(np.mod(angle_rad[chosen], 2 * np.pi))).max() < LARGEST_GAP_RAD / 2:
+            return chosen
+    return np.arange(len(angle_rad))
+
+
 def seen_half_height_mm(geometry: ConeBeam, radius_mm: float) -> float:
     """Return the height up to which every view sees all of a cylinder of this radius, mm."""
     half = (geometry.rows / 2 - 0.5) * geometry.pixel_mm - abs(geometry.row_shift_mm)

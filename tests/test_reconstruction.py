@@ -13,7 +13,7 @@ from pdvc.geometry import ConeBeam
 from pdvc.projection import project_at_rest
 from pdvc.radiographs import sharpened
 from pdvc.rays import ray_vectors
-from pdvc.reconstruction import angular_share, fdk, seen_half_height_mm
+from pdvc.reconstruction import LARGEST_GAP_RAD, angular_share, fdk, one_of, seen_half_height_mm
 from pdvc.volume import Grid, Volume, hull_of
 from tests.laws import law
 
@@ -191,3 +191,19 @@ def test_every_view_sees_all_of_a_cylinder_of_the_seen_half_height():
     # the nearest point of the cylinder is magnified most; it must stay within the outermost row's centre
     down = half * geometry.source_detector_mm / (geometry.source_axis_mm - 0.8)
     assert down == pytest.approx(21.5 * 0.5 - 0.7)
+
+
+@law()
+@given(st.integers(3, 700), st.integers(0, 8), st.randoms(use_true_random=False))
+def test_one_of_so_many_views_goes_all_around_in_whatever_order_they_were_taken(count, most, random):
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    random.shuffle(angles)
+    chosen = one_of(angles, most)
+    gaps = np.diff(np.sort(angles[chosen]), append=np.min(angles[chosen]) + 2 * np.pi)
+    assert (np.diff(chosen) > 0).all()
+    # as few as asked for where that leaves no gap, and all where any choice would
+    if count >= most * 40 and most > 0:
+        assert len(chosen) == -(-count // most)
+    if len(chosen) < count:
+        assert gaps.max() < LARGEST_GAP_RAD
+    assert len(chosen) >= count / max(most, 1)
