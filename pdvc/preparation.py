@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numba
@@ -221,15 +221,29 @@ def _systematic(
     reached = reached_rows(geometry, volume.grid, volume.hull)
     rays = ray_vectors(geometry, experiment.reference.angle_rad).stacked()
 
-    @cache
-    def left(i: int) -> NDArray[np.float16]:
-        field = np.zeros(shape, dtype=np.float16)
-        field[reached] = (project_at_rest(volume, rays[i : i + 1], shape)[0] - view(i))[reached]
-        # 11 bits of it are kept, of all views: e is a few times its noise
-        return field
+    kept: dict[int, NDArray[np.float16]] = {}
+
+    def ready(views: Sequence[int]) -> None:
+        missing = [i for i in views if i not in kept]
+        at_once = numba.get_num_threads()
+        # rays are walked by all threads together, a view is read and filtered by one of them
+        with ThreadPoolExecutor(at_once) as pool:
+            for start in range(0, len(missing), at_once):
+                some = [scale * i for i in missing[start : start + at_once]]
+                seen = pool.map(view, some)
+                again = project_at_rest(volume, rays[some], shape)
+                for i, grey, projected in zip(missing[start : start + at_once], seen, again, strict=True):
+                    # 11 bits are kept, of all views: e is a few times its noise
+                    kept[i] = np.zeros(shape, dtype=np.float16)
+                    kept[i][reached] = (projected - grey)[reached]
+
+    def left(i: int) -> Image:
+        ready([i])
+        return kept[i].astype(np.float32)
 
     return Systematic(
-        left=lambda i: left(i * scale).astype(np.float32),
+        left=left,
+        ready=ready,
         view_rad=experiment.reference.angle_rad[::scale],
         step_rad=experiment.test.angle_rad,
         corner=(part[0], part[2]),

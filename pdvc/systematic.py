@@ -21,7 +21,7 @@ e has edges of a pixel or two, ten times above its noise, so that it is interpol
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +81,10 @@ def views_around(view_rad: Floats, direction_rad: Floats, width_rad: float) -> t
     return order[places], share / share.sum(axis=1, keepdims=True)
 
 
+def _nothing(views: Sequence[int]) -> None:
+    """Make nothing ready."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Systematic:
     """e of the reference views, and what it takes to move it with the sample."""
@@ -88,6 +92,8 @@ class Systematic:
     left: Callable[[int], Image]
     """e (row, column), grey levels, of a reference view, over the whole detector; zero where the volume does not
     reach. Asked for again and again, and only of the views that steps look along."""
+    ready: Callable[[Sequence[int]], None] = _nothing
+    """Told which views will be asked for next, so that they can be made side by side."""
     view_rad: Floats
     """Stage angle of each reference view (view,)."""
     step_rad: Floats
@@ -128,6 +134,7 @@ class Systematic:
         maps = basis.affine(amplitude) * voxel_mm
         corner = np.array(self.corner, dtype=np.int64)
         sight = self.looked_along(steps, rays, basis, amplitude, voxel_mm)
+        self.ready(np.unique(sight.views[sight.share > 0]).tolist())
         for t, one in enumerate(result):
             field = np.zeros(self.detector, dtype=np.float32)
             for view, share in sight.of_step(t).items():

@@ -14,6 +14,10 @@ all motions, however many a section has.
 All lengths here are in voxels of the volume, l too, and all places are its indices: voxel (k, j, i) has its centre at
 x = i, y = j, z = k. Pixels are told by their centres, so that `rays` needs no half pixel.
 
+Neighbouring rays of a row are walked side by side, `LANES` of them, each in a lane of the processor's vectors: every
+kernel here does one thing for all of them, and its arrays hold one component after the other, each of all rays. A
+ray that is not concerned, of another axis or past its end, takes part with a share of zero.
+
 Sums run in single precision along a ray, in double precision over rays. Bands of rows are worked on in
 parallel and added in order, so that the result does not depend on the number of threads.
 

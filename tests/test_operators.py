@@ -17,7 +17,7 @@ from pdvc.radiographs import binned, coarsened, smoothed
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import _filtered, _ramp
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis, names_of
-from pdvc.sensitivity_sums import spread
+from pdvc.sensitivity_sums import overlaid, spread
 from pdvc.systematic import Systematic
 from tests.laws import law
 from tests.operators import dottest
@@ -239,6 +239,26 @@ def test_fields_whose_rows_meet_different_sections_are_spread_section_by_section
         one = replace(field, values=parts[..., k : k + 1].astype(np.float32), first=0 * field.first, motions=1)
         expected = dense(spread(one, places, whole), 1)[..., 0]
         np.testing.assert_allclose(dense(together, 10)[..., k], expected, atol=1e-5)
+
+
+@law(25)
+@given(st.integers(1, 12), st.integers(-6, 6), st.integers(0, 10**6))
+def test_fields_laid_over_each_other_take_room_for_the_sections_that_rows_meet_and_no_more(rise, moved, seed):
+    """A field spread some rows away leaves rows to the other one alone, far up the sample."""
+    rng, window, whole, corner = np.random.default_rng(seed), (24, 3), (60, 6), (18, 1)
+    field = Sensitivities(
+        values=rng.normal(size=(*window, 6)).astype(np.float32), first=100 + np.arange(24) // rise, motions=2
+    )
+    places = np.ones((*window, 3))
+    places[..., :2] = np.stack(np.indices(window), axis=-1) + np.array(corner) + [moved + 0.3, 0.5]
+    elsewhere = spread(field, places, whole)
+    even = np.ones(whole, dtype=np.float32)
+    together = overlaid([(elsewhere, even, (0, 0)), (field, even[:24, :3], corner)], whole)
+    # three sections a row, those of rows taken from, and of rows as far as the field was moved
+    assert together.values.shape[2] // 2 <= 3 + 2 + (4 + abs(moved)) // rise
+    expected = dense(elsewhere, 300)
+    expected[18:42, 1:4] += dense(field, 300)
+    np.testing.assert_allclose(dense(together, 300), expected, atol=1e-6)
 
 
 # Filters
