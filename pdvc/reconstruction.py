@@ -68,7 +68,7 @@ def fdk(
             batch = range(start, min(start + BATCH, len(angle_rad)))
             _back_project(
                 result,
-                np.ascontiguousarray(np.stack(list(pool.map(filtered, batch))).transpose(0, 2, 1)),
+                np.ascontiguousarray(np.stack(list(pool.map(filtered, batch)))[:, ::-1].transpose(0, 2, 1)),
                 beam[batch.start : batch.stop],
                 across[batch.start : batch.stop],
                 np.array(grid.origin_mm),
@@ -178,27 +178,48 @@ def _blend(one, two, f, first, last, out):  # type: ignore[no-untyped-def]
 
 
 @apart(fastmath=True, boundscheck=False)
-def _add_column(out, line, inside, first, r0, dr, top, weight):  # type: ignore[no-untyped-def]
-    """Add what the voxels of a column's slabs inside see: voxel k row r0 + k dr of a detector column."""
-    slab = 0
-    while slab < len(inside):
-        # slabs that follow each other are one piece of the column
-        start = slab
-        while slab < len(inside) and inside[slab]:
-            slab += 1
-        for k in range(first[start], first[slab]):
-            # beyond the detector its edge goes on; a scan's grid is only as high as every view sees, to a voxel or so
-            r = min(max(r0 + np.float32(k) * dr, np.float32(0)), top)
-            # unsigned: numba need not ask whether an index counts from the end
-            i = np.uint32(r)
-            low = line[i]
-            out[k] += weight * (low + (r - np.float32(i)) * (line[i + np.uint32(1)] - low))
-        slab += 1
+def _add_piece(out, line, first, last, place, step, weight):  # type: ignore[no-untyped-def]
+    """Add what the voxels first <= k < last of a column see, all of it on the detector: `line` at place + k step.
+
+    With a step of about one pixel, many voxels in turn lie between pixels k + c and k + c + 1 of the same c: what they
+    read lies in memory as what they write does.
+    """
+    k = first
+    while k < last:
+        r = place + k * step
+        i = int(r)
+        # the part between the two pixels grows by step - 1 from voxel to voxel, until it leaves [0, 1]
+        part, growth = r - i, step - 1.0
+        length = float(last - k)
+        if growth * length > 1.0 - part:
+            length = (1.0 - part) / growth
+        elif growth * length < -part:
+            length = -part / growth
+        end = min(k + int(length) + 1, last)
+        f, df = np.float32(part), np.float32(growth)
+        # unsigned: numba need not ask whether an index counts from the end
+        to, seen = np.uint64(k), np.uint64(i)
+        for n in range(np.uint64(end - k)):
+            low = line[seen + n]
+            out[to + n] += weight * (low + (f + np.float32(n) * df) * (line[seen + n + np.uint64(1)] - low))
+        k = end
+
+
+@apart(fastmath=True, boundscheck=False)
+def _add_beside(out, line, first, last, place, step, weight):  # type: ignore[no-untyped-def]
+    """The same where some of it is beside the detector, whose edge goes on there."""
+    top = np.float32(len(line) - 1.001)
+    for k in range(first, last):
+        r = min(max(np.float32(place + k * step), np.float32(0)), top)
+        # unsigned: numba need not ask whether an index counts from the end
+        i = np.uint32(r)
+        low = line[i]
+        out[k] += weight * (low + (r - np.float32(i)) * (line[i + np.uint32(1)] - low))
 
 
 @njit(nogil=True, cache=True, error_model="numpy", parallel=True)
 def _back_project(out, views, beam, across, origin, voxel, distances, shift, inside, first):  # type: ignore[no-untyped-def]
-    """Add a batch of filtered views (view, column, row) to the volume (y, x, z).
+    """Add a batch of filtered views (view, column, row from the lowest up) to the volume (y, x, z).
 
     A column of voxels along z has one depth U and one detector column u in each view, as the detector is level: its
     two neighbouring detector columns are blended once, and the rows follow in equal steps. So z comes last in the
@@ -229,16 +250,23 @@ def _back_project(out, views, beam, across, origin, voxel, distances, shift, ins
                 if u < 0 or u >= columns - 1:
                     continue
                 c = int(u)
-                r0 = -origin[2] * scale - shift[1] / pixel + 0.5 * (rows - 1)
-                dr = -voxel * scale
-                # rows count downwards, so that dr < 0; only rows that some voxel looks at are blended
-                r_from = max(int(r0 + dr * (high - 1)) - 1, 0)
-                r_to = min(int(max(r0 + dr * low, 0.0)) + 3, rows)
-                if r_from >= r_to:
-                    continue
-                if r0 + dr * low < 0 or r0 + dr * (high - 1) > rows - 1:
-                    r_from, r_to = 0, rows
+                # rows are counted from the lowest one up, as voxels are
+                place = 0.5 * (rows - 1) + shift[1] / pixel + origin[2] * scale
+                step = voxel * scale
+                bottom, top = place + step * low, place + step * (high - 1)
+                beside = bottom < 0 or top >= rows - 1
+                # only rows that some voxel looks at are blended
+                r_from, r_to = (0, rows) if beside else (int(bottom), min(int(top) + 2, rows))
                 _blend(views[n, c], views[n, c + 1], np.float32(u - c), r_from, r_to, line)
                 weight = np.float32((source / depth) ** 2)
-                top = np.float32(rows - 1.001)
-                _add_column(out[j, i], line, inside[j, i], first, np.float32(r0), np.float32(dr), top, weight)
+                slab = 0
+                while slab < inside.shape[2]:
+                    # slabs that follow each other are one piece of the column
+                    start = slab
+                    while slab < inside.shape[2] and inside[j, i, slab]:
+                        slab += 1
+                    if beside:
+                        _add_beside(out[j, i], line, first[start], first[slab], place, step, weight)
+                    else:
+                        _add_piece(out[j, i], line, first[start], first[slab], place, step, weight)
+                    slab += 1
