@@ -13,13 +13,13 @@ from numba import njit
 from numba.core.compiler import Compiler
 
 
-class _Apart(Compiler):  # type: ignore[misc]
+class _Apart(Compiler):
     """Numba's own passes, in the knowledge that arrays given to the function do not overlap."""
 
-    def define_pipelines(self):  # type: ignore[no-untyped-def]
+    def define_pipelines(self) -> Any:
         """Return numba's own passes."""
         self.state.flags.noalias = True
-        return super().define_pipelines()
+        return super().define_pipelines()  # type: ignore[no-untyped-call]
 
 
 def apart(**options: Any) -> Callable[..., Any]:

@@ -232,7 +232,7 @@ def _moved(m, i, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column, k):  # type: ignore[no-untyped-def]
+def _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, column, k):  # type: ignore[no-untyped-def]
     """Return the row and the column, on the whole detector, where a pixel's material was seen before it moved.
 
     And how many times as long a piece of it is along the ray as before, by which the path through it grew; and the
@@ -247,8 +247,8 @@ def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column
     x, y, z = x - sx, y - sy, z - sz
     # the point of the ray that is nearest to the axis
     at = -(sx * x + sy * y) / (x * x + y * y)
-    length = np.sqrt(x * x + y * y + z * z)
-    bx, by, bz = x / length, y / length, z / length
+    share = 1 / np.sqrt(x * x + y * y + z * z)
+    bx, by, bz = share * x, share * y, share * z
     x, y, z = sx + at * x, sy + at * y, sz + at * z
     while k > 0 and heights[k] >= z:
         k -= 1
@@ -272,39 +272,40 @@ def _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column
     x, y, z = cos * x - sin * y - sx, sin * x + cos * y - sy, z - sz
     scale = depth / (x * normal[0] + y * normal[1] + z * normal[2])
     x, y, z = sx + scale * x - ox, sy + scale * y - oy, sz + scale * z - oz
-    row, column = (x * dx + y * dy + z * dz) / pitch2 + corner[0], (x * rx + y * ry + z * rz) / pitch2 + corner[1]
+    row, column = (x * dx + y * dy + z * dz) * per_pitch2, (x * rx + y * ry + z * rz) * per_pitch2
+    row, column = row + corner[0], column + corner[1]
     return row, column, longer, k
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _panel(rays):  # type: ignore[no-untyped-def]
-    """Return the detector's normal, its distance from the source along it, and the square of the pitch."""
+    """Return the detector's normal, its distance from the source along it, and one over the square of the pitch."""
     dx, dy, dz = rays[2]
     rx, ry, rz = rays[3]
     nx, ny, nz = dy * rz - dz * ry, dz * rx - dx * rz, dx * ry - dy * rx
     depth = (rays[1, 0] - rays[0, 0]) * nx + (rays[1, 1] - rays[0, 1]) * ny + (rays[1, 2] - rays[0, 2]) * nz
-    return (nx, ny, nz), depth, dx * dx + dy * dy + dz * dz
+    return (nx, ny, nz), depth, 1 / (dx * dx + dy * dy + dz * dz)
 
 
 @njit(nogil=True, cache=True, parallel=True, error_model="numpy")
 def _register(field, rays, delta, heights, maps, corner, out):  # type: ignore[no-untyped-def]
     """Sample a step's field where each pixel's material was before it moved."""
-    normal, depth, pitch2 = _panel(rays)
+    normal, depth, per_pitch2 = _panel(rays)
     turn = np.cos(delta), np.sin(delta)
     for row in prange(out.shape[0]):
         k = 0
         for column in range(out.shape[1]):
-            r, c, longer, k = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column, k)
+            r, c, longer, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, column, k)
             out[row, column] = longer * _cubic(field, r, c)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _find_places(rays, delta, heights, maps, corner, out):  # type: ignore[no-untyped-def]
     """Write the places of all pixels of one step."""
-    normal, depth, pitch2 = _panel(rays)
+    normal, depth, per_pitch2 = _panel(rays)
     turn = np.cos(delta), np.sin(delta)
     k = 0
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
-            r, c, longer, k = _place(rays, turn, normal, depth, pitch2, heights, maps, corner, row, column, k)
+            r, c, longer, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, column, k)
             out[row, column] = r, c, longer
