@@ -208,7 +208,7 @@ def _add_piece(out, line, first, last, place, step, weight):  # type: ignore[no-
 @apart(fastmath=True, boundscheck=False)
 def _add_beside(out, line, first, last, place, step, weight):  # type: ignore[no-untyped-def]
     """The same where some of it is beside the detector, whose edge goes on there."""
-    top = np.float32(len(line) - 1.001)
+    top = np.float32(len(line) - 2.001)
     for k in range(first, last):
         r = min(max(np.float32(place + k * step), np.float32(0)), top)
         # unsigned: numba need not ask whether an index counts from the end
@@ -230,7 +230,8 @@ def _back_project(out, views, beam, across, origin, voxel, distances, shift, ins
     columns, rows = views.shape[1], views.shape[2]
     source, detector, pixel = distances
     for j in prange(ny):
-        line = np.empty(rows, np.float32)
+        # one more than there are rows: by rounding, the last voxel may look beyond with a share of nearly zero
+        line = np.zeros(rows + 1, np.float32)
         for i in range(nx):
             # voxels low <= k < high hold all of the hull in this column
             low, high = -1, -1
@@ -256,7 +257,7 @@ def _back_project(out, views, beam, across, origin, voxel, distances, shift, ins
                 bottom, top = place + step * low, place + step * (high - 1)
                 beside = bottom < 0 or top >= rows - 1
                 # only rows that some voxel looks at are blended
-                r_from, r_to = (0, rows) if beside else (int(bottom), min(int(top) + 2, rows))
+                r_from, r_to = (0, rows) if beside else (int(bottom), min(int(top) + 3, rows))
                 _blend(views[n, c], views[n, c + 1], np.float32(u - c), r_from, r_to, line)
                 weight = np.float32((source / depth) ** 2)
                 slab = 0
