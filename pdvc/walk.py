@@ -553,7 +553,7 @@ def _nine_sums(sums, turn, path, m, o, voxel_mm, nine):  # type: ignore[no-untyp
         nine[6 * LANES + _Z + ray] = h2 * scale
 
 
-@apart(fastmath=True)
+@apart()
 def _twelve(nine, whole, sign, s0, s1, base, along, twelve):  # type: ignore[no-untyped-def]
     """Write the integrals of w x_j d_i F and w d_i F (i, j, ray), with w = whole + sign s the share of a section."""
     for i in range(3):
@@ -567,7 +567,7 @@ def _twelve(nine, whole, sign, s0, s1, base, along, twelve):  # type: ignore[no-
             twelve[4 * LANES * i + 3 * LANES + ray] = flat
 
 
-@apart(fastmath=True)
+@apart()
 def _add_section(pattern, twelve, s, at):  # type: ignore[no-untyped-def]
     """Add to s (unknown, ray) the integrals of w Psi(x(l)) . grad F, for the motions of a section from `at` on.
 
@@ -583,19 +583,40 @@ def _add_section(pattern, twelve, s, at):  # type: ignore[no-untyped-def]
                 s[(at + motion) * LANES + ray] += pattern[motion, i] * twelve[i * LANES + ray]
 
 
-@apart(fastmath=True)
+@apart()
 def _add_products(s, first, last, weight, weighted_rho, matrix, vector):  # type: ignore[no-untyped-def]
     """Add w s s^T (lower triangle) and w s rho of all rays, of the unknowns first <= i < last.
 
     `s` (unknown, ray), `weight` and `weighted_rho` (ray,). The upper triangle is filled in once, at the end.
     """
     for i in range(first, last):
-        total = 0.0
-        for ray in range(LANES):
-            total += s[i * LANES + ray] * weighted_rho[ray]
-        vector[i] += total
+        vector[i] += _over_rays(s, i * LANES, weighted_rho, 0)
         for j in range(first, i + 1):
-            total = 0.0
-            for ray in range(LANES):
-                total += s[i * LANES + ray] * weight[ray] * s[j * LANES + ray]
-            matrix[i, j] += total
+            matrix[i, j] += _over_rays_weighted(s, i * LANES, j * LANES, weight)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _over_rays(one, i, other, j):  # type: ignore[no-untyped-def]
+    """Return the sum of products of two components, in an order that no compiler may change: bits are to be the same.
+
+    Four partial sums, side by side in a vector.
+    """
+    p, q, u, v = 0.0, 0.0, 0.0, 0.0
+    for ray in range(0, LANES, 4):
+        p += one[i + ray] * other[j + ray]
+        q += one[i + ray + 1] * other[j + ray + 1]
+        u += one[i + ray + 2] * other[j + ray + 2]
+        v += one[i + ray + 3] * other[j + ray + 3]
+    return (p + q) + (u + v)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+def _over_rays_weighted(s, i, j, weight):  # type: ignore[no-untyped-def]
+    """Return the same sum of products of two components of s with a weight."""
+    p, q, u, v = 0.0, 0.0, 0.0, 0.0
+    for ray in range(0, LANES, 4):
+        p += weight[ray] * s[i + ray] * s[j + ray]
+        q += weight[ray + 1] * s[i + ray + 1] * s[j + ray + 1]
+        u += weight[ray + 2] * s[i + ray + 2] * s[j + ray + 2]
+        v += weight[ray + 3] * s[i + ray + 3] * s[j + ray + 3]
+    return (p + q) + (u + v)
