@@ -225,6 +225,8 @@ def _systematic(
 
     def ready(views: Sequence[int]) -> None:
         missing = [i for i in views if i not in kept]
+        if not missing:
+            return
         at_once = numba.get_num_threads()
         # rays are walked by all threads together, a view is read and filtered by one of them
         with ThreadPoolExecutor(at_once) as pool:

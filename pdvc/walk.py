@@ -145,7 +145,8 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
     turn = np.empty(LANES)
     sums8 = np.empty(8 * LANES, np.float32)
     value, nine, twelve = np.empty(LANES), np.empty(9 * LANES), np.empty(12 * LANES)
-    s, used, weighted = np.zeros(vectors.shape[1] * LANES), np.empty(LANES), np.empty(LANES)
+    s, of_i = np.zeros(vectors.shape[1] * LANES), np.empty(LANES)
+    used, weighted = np.empty(LANES), np.empty(LANES)
     middle = 0.5 * (box[0] + box[1])
     # rows outside, columns inside: neighbours of a row walk through the same two layers of voxels, still in the cache
     for row in range(band * BAND_ROWS, min((band + 1) * BAND_ROWS, rows)):
@@ -212,7 +213,7 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
             # only the sections that these rays met: S is zero elsewhere, and so are its products
             if last_section >= 0:
                 first, last = (first_section - low) * motions, (last_section + 1 - low) * motions
-                _add_products(s, first, last, used, weighted, matrix, vectors[block])
+                _add_products(s, first, last, used, weighted, of_i, matrix, vectors[block])
                 if kept.size > 0:
                     for ray in range(count):
                         for i in range(first, last):
@@ -494,7 +495,11 @@ def _sum_all(volume, strides, most, first, last, phase, path, planes, sums):  # 
 
 @apart(fastmath=True, boundscheck=False)
 def _sum_values(volume, strides, most, first, last, phase, path, planes, sums):  # type: ignore[no-untyped-def]
-    """Sum F alone over the planes that each ray crosses (ray,); arguments as of _sum_all."""
+    """Sum F alone over the planes that each ray crosses (ray,); arguments as of _sum_all.
+
+    Written out: with the sample in a function that both loops call, the process that compiled them ran three times
+    slower than later ones, with the same bits.
+    """
     stride_m, stride_o, stride_z = strides
     most_o, most_z = most
     sums[:] = _f(0)
@@ -572,7 +577,7 @@ def _add_section(pattern, twelve, s, at):  # type: ignore[no-untyped-def]
     """Add to s (unknown, ray) the integrals of w Psi(x(l)) . grad F, for the motions of a section from `at` on.
 
     Psi is affine in x and x is linear in l, so that the twelve integrals hold all that the section's motions need: a
-    motion more costs twelve products more.
+    motion more costs a few products more.
     """
     for motion in range(pattern.shape[0]):
         for i in range(12):
@@ -584,39 +589,30 @@ def _add_section(pattern, twelve, s, at):  # type: ignore[no-untyped-def]
 
 
 @apart()
-def _add_products(s, first, last, weight, weighted_rho, matrix, vector):  # type: ignore[no-untyped-def]
+def _add_products(s, first, last, weight, weighted_rho, of_i, matrix, vector):  # type: ignore[no-untyped-def]
     """Add w s s^T (lower triangle) and w s rho of all rays, of the unknowns first <= i < last.
 
-    `s` (unknown, ray), `weight` and `weighted_rho` (ray,). The upper triangle is filled in once, at the end.
+    `s` (unknown, ray), `weight` and `weighted_rho` (ray,); `of_i` (ray,) is scratch. The upper triangle is filled in
+    once, at the end.
     """
     for i in range(first, last):
-        vector[i] += _over_rays(s, i * LANES, weighted_rho, 0)
+        vector[i] += _over_rays(weighted_rho, s, i * LANES)
+        for ray in range(LANES):
+            of_i[ray] = weight[ray] * s[i * LANES + ray]
         for j in range(first, i + 1):
-            matrix[i, j] += _over_rays_weighted(s, i * LANES, j * LANES, weight)
+            matrix[i, j] += _over_rays(of_i, s, j * LANES)
 
 
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
-def _over_rays(one, i, other, j):  # type: ignore[no-untyped-def]
-    """Return the sum of products of two components, in an order that no compiler may change: bits are to be the same.
+def _over_rays(one, other, at):  # type: ignore[no-untyped-def]
+    """Return the sum of products of two components, the other's from `at` on.
 
-    Four partial sums, side by side in a vector.
+    Four partial sums, side by side in a vector, in an order that no compiler may change: bits are to be the same.
     """
     p, q, u, v = 0.0, 0.0, 0.0, 0.0
     for ray in range(0, LANES, 4):
-        p += one[i + ray] * other[j + ray]
-        q += one[i + ray + 1] * other[j + ray + 1]
-        u += one[i + ray + 2] * other[j + ray + 2]
-        v += one[i + ray + 3] * other[j + ray + 3]
-    return (p + q) + (u + v)
-
-
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
-def _over_rays_weighted(s, i, j, weight):  # type: ignore[no-untyped-def]
-    """Return the same sum of products of two components of s with a weight."""
-    p, q, u, v = 0.0, 0.0, 0.0, 0.0
-    for ray in range(0, LANES, 4):
-        p += weight[ray] * s[i + ray] * s[j + ray]
-        q += weight[ray + 1] * s[i + ray + 1] * s[j + ray + 1]
-        u += weight[ray + 2] * s[i + ray + 2] * s[j + ray + 2]
-        v += weight[ray + 3] * s[i + ray + 3] * s[j + ray + 3]
+        p += one[ray] * other[at + ray]
+        q += one[ray + 1] * other[at + ray + 1]
+        u += one[ray + 2] * other[at + ray + 2]
+        v += one[ray + 3] * other[at + ray + 3]
     return (p + q) + (u + v)

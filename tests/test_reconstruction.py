@@ -13,7 +13,15 @@ from pdvc.geometry import ConeBeam
 from pdvc.projection import project_at_rest
 from pdvc.radiographs import sharpened
 from pdvc.rays import ray_vectors
-from pdvc.reconstruction import LARGEST_GAP_RAD, angular_share, fdk, one_of, seen_half_height_mm
+from pdvc.reconstruction import (
+    LARGEST_GAP_RAD,
+    _add_beside,
+    _add_piece,
+    angular_share,
+    fdk,
+    one_of,
+    seen_half_height_mm,
+)
 from pdvc.volume import Grid, Volume, hull_of
 from tests.laws import law
 
@@ -207,3 +215,19 @@ def test_one_of_so_many_views_goes_all_around_in_whatever_order_they_were_taken(
     if len(chosen) < count:
         assert gaps.max() < LARGEST_GAP_RAD
     assert len(chosen) >= count / max(most, 1)
+
+
+@law()
+@given(st.floats(0.0, 9.0), st.floats(0.3, 1.9) | st.floats(0.99, 1.01) | st.just(1.0), st.integers(0, 10**6))
+def test_a_column_read_in_runs_sees_what_it_sees_voxel_by_voxel(place, step, seed):
+    """However long voxels and rows keep step; the line has a place more than the detector has rows."""
+    rng, rows, first = np.random.default_rng(seed), 120, 3
+    last = min(int((rows - 1 - place) / step), 90)
+    line = np.append(rng.normal(size=rows), 0).astype(np.float32)
+    runs, one_by_one = np.zeros((2, 100), dtype=np.float32)
+    _add_piece(runs, line, first, last, place, step, np.float32(0.7))
+    _add_beside(one_by_one, line, first, last, place, step, np.float32(0.7))
+    np.testing.assert_allclose(runs, one_by_one, atol=1e-4)
+    assert runs[first:last].all()
+    assert not runs[:first].any()
+    assert not runs[last:].any()
