@@ -7,9 +7,14 @@ new step adds its bend w, which joins three steps, and its data; the oldest stat
 
 at a cost that does not grow with the number of steps. The step in hand is the last one so far, and has the prior of
 ends: the filter at step t is the smoother of a test that ended there, and at the last step the smoother itself.
+
+Whatever data do to the states is linear in them: errors that steps have in common go through the same sums as further
+right-hand sides, and come out as what they do to the motion.
 """
 
 from __future__ import annotations
+
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,71 +29,103 @@ Floats = NDArray[np.float64]
 class Filter:
     """What is known of the states after some steps."""
 
-    def __init__(self, space: StateSpace, deviations: Deviations) -> None:
-        """Begin before the first step; deviations are of all bends that will be asked for."""
-        self._space = space
-        self._weight = 1 / space.bend_variance(deviations)
-        self._end = 1 / space.end_variance(deviations)
-        self._steps = 0
+    def __init__(self, space: StateSpace, end_variance: Floats, errors: int = 0) -> None:
+        """Begin before the first step, with the variance of the ends (state,) and a number of errors to follow."""
+        self.steps = 0
+        """Steps taken in so far."""
+        self._space, self._end = space, 1 / end_variance
         parameters = space.trend.shape[2]
-        self._matrix = np.eye(parameters) / space.prior_voxel**2
+        self.matrix = np.eye(parameters) / space.prior_voxel**2
         """Information of the last two states, fewer at the beginning, and p."""
-        self._vector = np.zeros(parameters)
+        self.vectors = np.zeros((parameters, 1 + errors))
+        """Information vectors of the same, of the data and of each error."""
 
-    def add(self, information: Floats, vector: Floats) -> None:
-        """Take in the next step: what its data tell, J' (state, state) and v' (state,) of `pdvc.apparent.Reduced`."""
-        states, t = len(vector), self._steps
+    @property
+    def errors(self) -> int:
+        """Return the number of errors that are followed."""
+        return self.vectors.shape[1] - 1
+
+    def copied(self) -> Filter:
+        """Return another filter that knows the same."""
+        # matrix and vectors are replaced, never written into
+        return copy(self)
+
+    def add(self, information: Floats, vectors: Floats, bend_variance: Floats) -> None:
+        """Take in the next step: what its data tell, J' (state, state) and v' (state, 1 + error) of `pdvc.apparent`.
+
+        `bend_variance` (state,), voxel^2, of the bend that ends at this step; of the first two steps it is not used.
+        A step without a radiograph has no information, and zeros for vectors.
+        """
+        states, t = len(vectors), self.steps
         if t >= self._space.shape[0]:
             raise ValueError(f"step: expected at most {t}, as many as the state space has, got another one")
         # the new state goes between the older ones and the trend
         at = min(t, 2) * states
-        for axis in (0, 1):
-            self._matrix = np.insert(self._matrix, [at] * states, 0.0, axis=axis)
-        self._vector = np.insert(self._vector, [at] * states, 0.0)
-        new, trend = slice(at, at + states), self._space.trend[t]
+        matrix = np.insert(np.insert(self.matrix, [at] * states, 0.0, axis=0), [at] * states, 0.0, axis=1)
+        both = np.insert(self.vectors, [at] * states, 0.0, axis=0)
+        new, trend, i = slice(at, at + states), self._space.trend[t], np.arange(states)
         if t == 0:
-            self._matrix[new, new] += np.diag(self._end)
+            matrix[i, i] += self._end
         if t >= 2:
-            self._bend(t - 2, states)
+            factors = self._space.second_differences[t - 2]
+            for k, one in enumerate(factors):
+                for m, other in enumerate(factors):
+                    matrix[i + k * states, i + m * states] += one * other / bend_variance
         of_trend = information @ trend
         rest = slice(at + states, None)
-        self._matrix[new, new] += information
-        self._matrix[new, rest] += of_trend
-        self._matrix[rest, new] += of_trend.T
-        self._matrix[rest, rest] += trend.T @ of_trend
-        self._vector[new] += vector
-        self._vector[rest] += trend.T @ vector
-        if t >= 2:
-            self._forget(states)
-        self._steps += 1
+        matrix[new, new] += information
+        matrix[new, rest] += of_trend
+        matrix[rest, new] += of_trend.T
+        matrix[rest, rest] += trend.T @ of_trend
+        both[new] += vectors
+        both[rest] += trend.T @ vectors
+        self.matrix, self.vectors = _without(matrix, both, states) if t >= 2 else (matrix, both)
+        self.steps += 1
 
     def now(self) -> tuple[Floats, Floats]:
-        """Return mean (state,) and covariance (state, state) of the states of the last step so far, trend included."""
-        states, t = self._space.shape[1], self._steps - 1
-        matrix, at = self._matrix.copy(), min(t, 1) * states
-        new = np.arange(at, at + states)
-        if t > 0:
-            matrix[new, new] += self._end
-        covariance = linalg.inv(matrix)
-        picked = np.concatenate([np.eye(states), self._space.trend[t]], axis=1)
-        mean, covariance = (covariance @ self._vector)[at:], covariance[at:, at:]
-        return np.asarray(picked @ mean), np.asarray(picked @ covariance @ picked.T)
+        """Return means (state, 1 + error) and covariance (state, state) of the last step's states, trend included."""
+        states, t = self._space.shape[1], self.steps - 1
+        picked = np.zeros((states, len(self.matrix)))
+        at = min(t, 1) * states
+        picked[:, at : at + states] = np.eye(states)
+        picked[:, at + states :] = self._space.trend[t]
+        return self._of(picked)
 
-    def _bend(self, index: int, states: int) -> None:
-        """Add the prior of a bend of three states, the first ones held."""
-        factors, i = self._space.second_differences[index], np.arange(states)
-        for k, one in enumerate(factors):
-            for m, other in enumerate(factors):
-                self._matrix[i + k * states, i + m * states] += one * other * self._weight[index]
+    def ahead(self) -> tuple[Floats, Floats]:
+        """Return the same of the next step, before its data, as if it had no bend.
 
-    def _forget(self, states: int) -> None:
-        """Eliminate the first state held."""
-        old, kept = slice(0, states), slice(states, None)
-        lower = linalg.cholesky(self._matrix[old, old], lower=True)
-        joint = linalg.solve_triangular(lower, self._matrix[old, kept], lower=True)
-        own = linalg.solve_triangular(lower, self._vector[old], lower=True)
-        self._matrix = self._matrix[kept, kept] - joint.T @ joint
-        self._vector = self._vector[kept] - joint.T @ own
+        A second step is where the first one was, anywhere around it that the prior of ends allows, and so is a first.
+        """
+        states, t = self._space.shape[1], self.steps
+        picked, i = np.zeros((states, len(self.matrix))), np.arange(states)
+        if t >= 2:
+            a, b, c = self._space.second_differences[t - 2]
+            picked[i, i], picked[i, states + i] = -a / c, -b / c
+        elif t == 1:
+            picked[i, i] = 1
+        picked[:, min(t, 2) * states :] = self._space.trend[t]
+        mean, covariance = self._of(picked)
+        if t < 2:
+            covariance[i, i] += 1 / self._end
+        return mean, covariance
+
+    def _of(self, picked: Floats) -> tuple[Floats, Floats]:
+        """Return means and covariance of combinations (state, held) of what is held, the last state an end."""
+        matrix, states = self.matrix.copy(), self._space.shape[1]
+        if self.steps > 1:
+            last = np.arange(states, 2 * states)
+            matrix[last, last] += self._end
+        covariance = picked @ linalg.inv(matrix)
+        return np.asarray(covariance @ self.vectors), np.asarray(covariance @ picked.T)
+
+
+def _without(matrix: Floats, vectors: Floats, states: int) -> tuple[Floats, Floats]:
+    """Return information matrix and vectors once the first state held is eliminated."""
+    old, kept = slice(0, states), slice(states, None)
+    lower = linalg.cholesky(matrix[old, old], lower=True)
+    joint = linalg.solve_triangular(lower, matrix[old, kept], lower=True)
+    own = linalg.solve_triangular(lower, vectors[old], lower=True)
+    return matrix[kept, kept] - joint.T @ joint, vectors[kept] - joint.T @ own
 
 
 def filtered(process: Process, deviations: Deviations) -> tuple[Floats, Floats]:
@@ -96,12 +133,18 @@ def filtered(process: Process, deviations: Deviations) -> tuple[Floats, Floats]:
 
     Each from the data of that step and those before it, under given deviations.
     """
-    told, to = process.told(deviations), process.space.to_amplitude
-    known = Filter(process.space, deviations)
+    space, to, told = process.space, process.space.to_amplitude, process.told(deviations)
+    known, bends = Filter(space, space.end_variance(deviations)), bends_to(space, deviations)
     mean, covariance = [], []
-    for information, vector in zip(told.information, told.vector, strict=True):
-        known.add(information, vector)
+    for information, vector, bend in zip(told.information, told.vector, bends, strict=True):
+        known.add(information, vector[:, None], bend)
         x, spread = known.now()
-        mean.append(to @ x)
+        mean.append(to @ x[:, 0])
         covariance.append(to @ spread @ to.T)
     return np.stack(mean), np.stack(covariance)
+
+
+def bends_to(space: StateSpace, deviations: Deviations) -> Floats:
+    """Return the variance of the bend that ends at each step (step, state), voxel^2; the first two end none."""
+    steps = space.shape[0]
+    return np.concatenate([np.ones((min(steps, 2), space.shape[1])), space.bend_variance(deviations)])

@@ -41,6 +41,7 @@ from pdvc.radiographs import noise_overlap, smoothed
 from pdvc.sections import SectionBasis
 from pdvc.sensitivity_sums import Pile, adjoint, overlaid, product, spread
 from pdvc.systematic import Sight, Systematic, taps
+from pdvc.volume import Volume
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -133,8 +134,7 @@ def propagate(
     `systematic` tells which views each step looks along, whether it is subtracted or not. Costs a pass over all
     radiographs, and about as much again.
     """
-    volume = replace(images.volume, values=smoothed(images.volume.values, noise.smooth_px))
-    images = replace(images, volume=volume)
+    images = replace(images, volume=meeting_noise(images.volume, noise.smooth_px))
     apart = separate(time_functions)
     unknowns = basis.shape[0] * basis.shape[1]
     own = {name: np.empty((len(amplitude), unknowns, unknowns)) for name in SOURCES}
@@ -144,18 +144,15 @@ def propagate(
     sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
     held: dict[int, Sensitivities] = {}
 
-    def add_step(step: int, weighted: Sensitivities, left: Image | None) -> tuple[Sensitivities, Sensitivities]:
-        """Add what the step's own noise does; return Y, which its views' noise needs, and what the flats' needs."""
-        image, view = noise.step(step), mean_of_views(noise, sight.of_step(step))
+    def add_step(step: int, weighted: Sensitivities, left: Image | None) -> StepNoise:
+        """Add what the step's own noise does; return what its views' noise and the flats' meet."""
         places = systematic.places(step, images.rays[step], basis, amplitude[step], images.voxel_mm)
-        moved = spread(weighted, places, noise.flat.shape)
-        shared = overlaid([(moved, view.slope, (0, 0)), (weighted, -image.slope, systematic.corner)], noise.flat.shape)
-        own["radiographs"][step] = product(weighted, weighted, image.variance, unknowns)
-        own["views"][step] = product(moved, moved, view.variance, unknowns)
-        own["flats"][step] = product(shared, shared, noise.flat, unknowns)
+        found = StepNoise.of(noise, step, sight.of_step(step), weighted, places, systematic.corner)
+        for name, covariance in found.own(noise.flat, unknowns).items():
+            own[name][step] = covariance
         if left is not None:
             believed[step] = BELIEF * adjoint(weighted, left, unknowns)
-        return moved, shared
+        return found
 
     def joint_of(pair: tuple[int, int, Mapping[int, float]]) -> Floats:
         """Return what the noise of the views does that two steps both look along."""
@@ -171,12 +168,12 @@ def propagate(
     with ThreadPoolExecutor(at_once) as pool:
         for done in range(0, len(order), at_once):
             steps = order[done : done + at_once]
-            fields = _weighted(images, basis, amplitude, steps)
-            left = [_registered(images, basis, amplitude, t) for t in steps]
-            for t, (moved, shared) in zip(steps, pool.map(add_step, steps, fields, left), strict=True):
-                held[t] = moved
+            fields = weighted_sensitivities(images, basis, amplitude, steps)
+            left = [registered_left(images, basis, amplitude, t) for t in steps]
+            for t, found in zip(steps, pool.map(add_step, steps, fields, left), strict=True):
+                held[t] = found.moved
                 if pile is not None:
-                    pile.add(t, shared, pool)
+                    pile.add(t, found.shared, pool)
             together = [(t, other, shares) for t in steps for other, shares in company[t].items()]
             # in this order, whichever is ready first: sums over pairs are to have the same bits
             for (t, other, _), joint in zip(together, pool.map(joint_of, together), strict=True):
@@ -192,6 +189,52 @@ def propagate(
     common = time_functions @ believed
     parts["systematic"] = common[:, :, None] * common[:, None] if apart else np.outer(common.ravel(), common.ravel())
     return Propagated(parts=parts, own=own, systematic=believed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepNoise:
+    """What the noise of one step's images meets."""
+
+    image: ImageNoise
+    """Of the radiograph, over the window."""
+    view: ImageNoise
+    """Of the mean of the reference views that it looks along, over the whole detector."""
+    weighted: Sensitivities
+    """W S, in the window."""
+    moved: Sensitivities
+    """Y = R^T W S, over the whole detector."""
+    shared: Sensitivities
+    """s_f Y - s_t W S, which an error of the flats meets, over the whole detector."""
+
+    @classmethod
+    def of(
+        cls,
+        noise: Noise,
+        step: int,
+        shares: Mapping[int, float],
+        weighted: Sensitivities,
+        places: Floats,
+        corner: tuple[int, int],
+    ) -> StepNoise:
+        """Work out what the noise of a step meets; `shares` of its views, `places` of `Systematic.places`."""
+        image, view = noise.step(step), mean_of_views(noise, shares)
+        moved = spread(weighted, places, noise.flat.shape)
+        both = [(moved, view.slope, (0, 0)), (weighted, -image.slope, corner)]
+        shared = overlaid(both, noise.flat.shape)
+        return cls(image=image, view=view, weighted=weighted, moved=moved, shared=shared)
+
+    def own(self, flat: Image, unknowns: int) -> dict[str, Floats]:
+        """Return V of the step alone, by `SOURCES`, for a variance of the mean flat (row, column)."""
+        return {
+            "radiographs": product(self.weighted, self.weighted, self.image.variance, unknowns),
+            "views": product(self.moved, self.moved, self.view.variance, unknowns),
+            "flats": product(self.shared, self.shared, flat, unknowns),
+        }
+
+
+def meeting_noise(volume: Volume, smooth_px: float) -> Volume:
+    """Return the volume filtered once more, as the sensitivities are that noise meets."""
+    return replace(volume, values=smoothed(volume.values, smooth_px))
 
 
 def separate(time_functions: Floats) -> bool:
@@ -228,7 +271,9 @@ def mean_of_views(noise: Noise, shares: Mapping[int, float]) -> ImageNoise:
     )
 
 
-def _weighted(images: Images, basis: SectionBasis, amplitude: Floats, steps: Sequence[int]) -> list[Sensitivities]:
+def weighted_sensitivities(
+    images: Images, basis: SectionBasis, amplitude: Floats, steps: Sequence[int]
+) -> list[Sensitivities]:
     """Return the sensitivities of steps, each pixel's times its weight."""
     shape = (images.grey.shape[1], images.grey.shape[2])
     rays, there = images.rays[steps], amplitude[steps]
@@ -238,7 +283,7 @@ def _weighted(images: Images, basis: SectionBasis, amplitude: Floats, steps: Seq
     return fields
 
 
-def _registered(images: Images, basis: SectionBasis, amplitude: Floats, step: int) -> Image | None:
+def registered_left(images: Images, basis: SectionBasis, amplitude: Floats, step: int) -> Image | None:
     """Return e of a step, if it is subtracted."""
     if images.systematic is None:
         return None

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pdvc.equations import Images
-from pdvc.noise import Noise
+from pdvc.noise import ImageNoise, Noise
 from pdvc.radiographs import noise_overlap
 from pdvc.sections import SectionBasis
 from pdvc.systematic import Systematic
@@ -57,25 +57,67 @@ def fixed_pattern(
 ) -> Pattern:
     """Return the pattern that a residual (step, row, column) shows, at amplitudes (step, section, motion), voxels."""
     steps, window = len(residual), systematic.window
-    kept = noise_overlap(noise.smooth_px)[0] ** 2
     own, slope = np.zeros(systematic.shape), np.zeros(systematic.shape)
     for t in range(steps):
         image = noise.step(t)
-        # a reference view has at most as much
-        own += 2 * kept * image.variance / steps
+        own += image.variance / steps
         slope += image.slope / steps
-    prior = kept * slope**2 * noise.flat[window]
-    share = 1 - left_of_flats(prior, own, steps)
-    most = MOST * np.sqrt(prior)
+    share, most = _weighed(systematic, noise, own, slope, steps)
     grey = np.zeros(systematic.detector, dtype=np.float32)
     mean = residual.mean(axis=0, dtype=float)
     for _ in range(ROUNDS):
         moved = _mean_moved(images, systematic, basis, amplitude, grey)
         grey[window] = np.clip(_fine(grey[window] - share * (mean + grey[window] - moved)), -most, most)
+    return Pattern(grey=grey, left=_left(systematic, share))
+
+
+class GrowingPattern:
+    """The pattern as far as the radiographs so far tell it, each of them without what those before it told.
+
+    With psi_t what was taken from the images of a step, its residual is rho(t) + psi_t - R_t psi_t, so that the mean
+    of residual - psi_t over the steps is minus psi, but for what R_t still moves.
+    """
+
+    def __init__(self, systematic: Systematic, noise: Noise) -> None:
+        """Begin with no radiograph."""
+        self._systematic, self._noise = systematic, noise
+        self.steps = 0
+        self.sums = np.zeros((3, *systematic.shape))
+        """Of psi_t - residual, of the radiographs' variance, and of dg / dq, over the steps (3, row, column)."""
+
+    def add(self, residual: Image, taken: Image, image: ImageNoise) -> None:
+        """Take in a residual (row, column), what was taken from its images (the same), and its radiograph's noise."""
+        self.steps += 1
+        self.sums += np.stack([taken - residual, image.variance, image.slope])
+
+    def found(self) -> Pattern:
+        """Return what is known now."""
+        grey = np.zeros(self._systematic.detector, dtype=np.float32)
+        if not self.steps:
+            return Pattern(grey=grey, left=np.ones_like(grey))
+        mean, own, slope = self.sums / self.steps
+        share, most = _weighed(self._systematic, self._noise, own, slope, self.steps)
+        grey[self._systematic.window] = np.clip(_fine(share * mean), -most, most)
+        return Pattern(grey=grey, left=_left(self._systematic, share))
+
+
+def _weighed(systematic: Systematic, noise: Noise, own: Floats, slope: Floats, steps: int) -> tuple[Floats, Floats]:
+    """Return the share v_psi / (v_psi + v / T) and the most that psi may be (row, column), grey levels.
+
+    From the mean variance of radiographs, unfiltered, and the mean slope dg / dq, both (row, column).
+    """
+    kept = noise_overlap(noise.smooth_px)[0] ** 2
+    prior = kept * slope**2 * noise.flat[systematic.window]
+    # a reference view has at most as much noise as a radiograph
+    return 1 - left_of_flats(prior, 2 * kept * own, steps), MOST * np.sqrt(prior)
+
+
+def _left(systematic: Systematic, share: Floats) -> Image:
+    """Return the share of the flats' variance that is left (row, column), over the whole detector."""
     left = np.ones(systematic.detector, dtype=np.float32)
     # of white noise, the Gaussian's mean keeps 1 / (4 pi sigma^2)
-    left[window] = 1 - share * (1 - 1 / (4 * np.pi * SMOOTH_PX**2))
-    return Pattern(grey=grey, left=left)
+    left[systematic.window] = 1 - share * (1 - 1 / (4 * np.pi * SMOOTH_PX**2))
+    return left
 
 
 def _fine(image: Floats) -> Floats:

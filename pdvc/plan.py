@@ -99,7 +99,7 @@ class Planner:
         self._setup = set_up(replace(experiment, test=experiment.reference), options, progress=progress)
         self._reference_rad = experiment.reference.angle_rad
         prepared = prepare(self._setup, 1, progress)
-        noise = stated_noise(self._setup, prepared)
+        noise, _ = stated_noise(self._setup, prepared.systematic)
         self._noise = noise
         self._images = prepared.images
         self._systematic = prepared.systematic

@@ -72,17 +72,43 @@ class Prepared:
         return replace(self, images=images, systematic=systematic, view=lambda i: self.view(i) - pattern)
 
 
-def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:
-    """Prepare one scale: volume, radiographs of the window, weights, systematic residual."""
+@dataclass(frozen=True, kw_only=True)
+class AtRest:
+    """What one scale takes from the reference scan: all that there is before the test begins."""
+
+    scale: int
+    volume: Volume
+    geometry: ConeBeam
+    """Of this scale, the whole detector."""
+    part: tuple[int, ...]
+    """The used window at this scale: row_from, row_to, column_from, column_to."""
+    view: Callable[[int], Image]
+    """A reference view (row, column), grey levels, over the whole detector."""
+    systematic: Systematic
+    """What the volume's re-projection leaves; it knows of no step yet."""
+
+
+def at_rest(setup: Setup, scale: int, progress: Progress = silent) -> AtRest:
+    """Return what one scale takes from the reference scan."""
     experiment, options = setup.experiment, setup.options
     geometry = experiment.geometry.binned(scale)
     part = tuple(edge // scale for edge in setup.window)
-    used = geometry.cropped(*part)
     view = _viewer(experiment.reference, setup.calibration, scale, options.smooth_px)
     volume = reference_volume(setup, scale, progress)
-    systematic = _systematic(experiment, geometry, part, view, volume, setup.sections.radius_mm, scale)
-    grey, variance = _test_radiographs(experiment, setup.calibration, part, scale, options.smooth_px, progress)
-    good = ~_coarse_bad(setup.calibration.bad, scale)[part[0] : part[1], part[2] : part[3]]
+    systematic = _systematic(experiment.reference, geometry, part, view, volume, setup.sections.radius_mm, scale)
+    return AtRest(scale=scale, volume=volume, geometry=geometry, part=part, view=view, systematic=systematic)
+
+
+def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:
+    """Prepare one scale: volume, radiographs of the window, weights, systematic residual."""
+    return with_radiographs(setup, at_rest(setup, scale, progress), setup.experiment.test, progress)
+
+
+def with_radiographs(setup: Setup, rest: AtRest, test: Series, progress: Progress = silent) -> Prepared:
+    """Prepare radiographs of the test at the scale of what is known at rest."""
+    experiment, options, part = setup.experiment, setup.options, rest.part
+    grey, variance = _test_radiographs(setup, test, part, rest.scale, progress)
+    good = ~_coarse_bad(setup.calibration.bad, rest.scale)[part[0] : part[1], part[2] : part[3]]
     if not good.any():
         raise ValueError("mask: expected some used pixels, but all of the window are bad")
     weight = good[None].astype(np.float32)
@@ -94,17 +120,18 @@ def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:
             )
         inverse = good / variance
         weight = np.asarray(inverse / inverse[:, good].mean(), dtype=np.float32)
+    systematic = replace(rest.systematic, step_rad=test.angle_rad)
     return Prepared(
         images=Images(
-            rays=ray_vectors(used, experiment.test.angle_rad).stacked(),
+            rays=ray_vectors(rest.geometry.cropped(*part), test.angle_rad).stacked(),
             grey=grey,
             weight=weight,
-            volume=volume,
+            volume=rest.volume,
             systematic=systematic if options.subtract_systematic else None,
             voxel_mm=experiment.geometry.voxel_mm,
         ),
         systematic=systematic,
-        view=view,
+        view=rest.view,
         snr_noise_db=_noise_snr(grey, variance, good),
         noise_rms=None if variance is None else float(np.sqrt(variance[:, good].mean(dtype=float))),
     )
@@ -204,7 +231,7 @@ def _differences(values: NDArray[np.float32], order: int) -> Iterator[NDArray[np
 
 
 def _systematic(
-    experiment: Experiment,
+    reference: Series,
     geometry: ConeBeam,
     part: tuple[int, ...],
     view: Callable[[int], Image],
@@ -219,7 +246,7 @@ def _systematic(
     """
     shape = (geometry.rows, geometry.columns)
     reached = reached_rows(geometry, volume.grid, volume.hull)
-    rays = ray_vectors(geometry, experiment.reference.angle_rad).stacked()
+    rays = ray_vectors(geometry, reference.angle_rad).stacked()
 
     kept: dict[int, NDArray[np.float16]] = {}
 
@@ -246,8 +273,8 @@ def _systematic(
     return Systematic(
         left=left,
         ready=ready,
-        view_rad=experiment.reference.angle_rad[::scale],
-        step_rad=experiment.test.angle_rad,
+        view_rad=reference.angle_rad[::scale],
+        step_rad=np.empty(0),
         corner=(part[0], part[2]),
         shape=(part[1] - part[0], part[3] - part[2]),
         detector=shape,
@@ -256,19 +283,14 @@ def _systematic(
 
 
 def _test_radiographs(
-    experiment: Experiment,
-    calibration: Calibration,
-    part: tuple[int, ...],
-    scale: int,
-    smooth_px: float,
-    progress: Progress,
+    setup: Setup, test: Series, part: tuple[int, ...], scale: int, progress: Progress
 ) -> tuple[Image, Image | None]:
     """Return grey levels and, where the noise is known, their variances, over the window (step, row, column)."""
-    test = experiment.test
+    calibration, smooth_px = setup.calibration, setup.options.smooth_px
     window = (slice(part[0], part[1]), slice(part[2], part[3]))
     shape = (len(test), part[1] - part[0], part[3] - part[2])
     grey = np.empty(shape, dtype=np.float32)
-    noise = detector_noise(experiment)
+    noise = detector_noise(setup.experiment)
     variance = None if noise is None else np.empty(shape, dtype=np.float32)
     view = _viewer(test, calibration, scale, smooth_px)
     left = _noise_left(scale, smooth_px)
@@ -277,7 +299,7 @@ def _test_radiographs(
         grey[t] = view(t)[window]
         if variance is not None and noise is not None:
             fine, slope = grey_noise(test.counts[t], calibration, noise)
-            fine += slope**2 * noise.relative_variance(calibration.open_beam, len(experiment.flats))
+            fine += slope**2 * noise.relative_variance(calibration.open_beam, len(setup.experiment.flats))
             variance[t] = left * binned(fine, scale)[window]
 
     # a radiograph is read and filtered by one thread
@@ -287,39 +309,46 @@ def _test_radiographs(
     return grey, variance
 
 
-def noise_of(setup: Setup, prepared: Prepared) -> Noise | None:
+def noise_of(setup: Setup, systematic: Systematic) -> Noise | None:
     """Return the noise of all images at scale 1, if the experiment's description tells of it."""
     experiment, calibration = setup.experiment, setup.calibration
     noise = detector_noise(experiment)
     if noise is None:
         return None
     known: DetectorNoise = noise
-    window = prepared.systematic.window
-
-    def step(t: int) -> ImageNoise:
-        variance, slope = grey_noise(experiment.test.counts[t], calibration, known)
-        return ImageNoise(variance=variance[window], slope=slope[window])
 
     @lru_cache(maxsize=_VIEWS_AT_HAND)
     def view(i: int) -> ImageNoise:
         variance, slope = grey_noise(experiment.reference.counts[i], calibration, known)
         return ImageNoise(variance=variance, slope=slope)
 
+    def step(t: int) -> ImageNoise:
+        return radiograph_noise(setup, systematic, known, experiment.test.counts[t])
+
     flat = known.relative_variance(calibration.open_beam, len(experiment.flats))
     return Noise(step=step, view=view, flat=flat, smooth_px=setup.options.smooth_px)
 
 
-def stated_noise(setup: Setup, prepared: Prepared) -> Noise:
-    """Return the noise of all images at scale 1; raises ValueError where the experiment's description tells none."""
-    noise = noise_of(setup, prepared)
-    if noise is None:
+def radiograph_noise(
+    setup: Setup, systematic: Systematic, noise: DetectorNoise, counts: NDArray[np.uint16]
+) -> ImageNoise:
+    """Return the noise, over the window of scale 1, of a radiograph of the test by its counts (row, column)."""
+    variance, slope = grey_noise(counts, setup.calibration, noise)
+    return ImageNoise(variance=variance[systematic.window], slope=slope[systematic.window])
+
+
+def stated_noise(setup: Setup, systematic: Systematic) -> tuple[Noise, DetectorNoise]:
+    """Return the noise of all images at scale 1, and the detector's; raises ValueError where none is stated."""
+    noise, detector = noise_of(setup, systematic), detector_noise(setup.experiment)
+    if noise is None or detector is None:
         raise ValueError(
             "noise: expected photons_per_count and readout_noise_counts in [acquisition] of experiment.toml, "
             "found none"
         )
-    return noise
+    return noise, detector
 
 
+@lru_cache
 def _noise_left(scale: int, smooth_px: float) -> float:
     """Return what filters and binning leave of the variance of white noise, by their impulse response."""
     size = 16 * scale + 2 * int(4 * smooth_px + 1)

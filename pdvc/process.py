@@ -144,10 +144,13 @@ class Process:
     def fitted(self, deviations: Deviations, rounds: int = ROUNDS) -> Deviations:
         """Return deviations of the largest marginal likelihood: q, e, n and r, and the scales, in turn."""
         for _ in range(rounds):
-            deviations = self._likeliest(deviations)
-            smoothed = self.smoothed(deviations)
-            deviations = self._rescaled(deviations, smoothed, smoothed.factor.inverted())
+            deviations = self.rescaled(self._likeliest(deviations))
         return deviations
+
+    def rescaled(self, deviations: Deviations) -> Deviations:
+        """Return deviations with the scales of steps as the data make them expected, once."""
+        smoothed = self.smoothed(deviations)
+        return self._rescaled(deviations, smoothed, smoothed.factor.inverted())
 
     def _squares(self, smoothed: Smoothed, inverse: Blocks) -> tuple[Floats, Floats]:
         """Return E[w^2] (step - 2, state), and E[x^2] of the ends (end, state)."""
@@ -204,9 +207,7 @@ class Process:
         """Return deviations with scales as expected under Student's distribution."""
         space = self.space
         bends, _ = self._squares(smoothed, inverse)
-        flat = replace(deviations, rigid_scale=np.ones((len(bends), space.rigid)), own_scale=np.ones(len(bends)))
-        share = bends / space.bend_variance(flat)
-        rigid = space.group < space.rigid
+        share = bends / space.bend_variance(unscaled(deviations))
         apparent = self._apparent(smoothed, inverse)
         mean, covariance = smoothed.reduced.seen(self._total(smoothed), self._of_states(smoothed, inverse))
         left = self.seen.data - np.einsum("tnm,tm->tn", self._design, mean)
@@ -219,8 +220,7 @@ class Process:
         apparent_scale[space.ends] = 1
         return replace(
             deviations,
-            rigid_scale=_expected(share[:, rigid, None], RIGID_FREEDOM),
-            own_scale=_expected(share[:, ~rigid], FREEDOM),
+            **bend_scales(space, share),
             misfit=(FREEDOM + (left**2).sum(axis=1) + spread) / (FREEDOM + self.seen.unknowns),
             apparent_scale=apparent_scale,
         )
@@ -232,6 +232,27 @@ class Process:
     def _apparent(self, smoothed: Smoothed, inverse: Blocks) -> Floats:
         """Return E[eta^2] (step, state)."""
         return smoothed.reduced.apparent(self._total(smoothed), self._of_states(smoothed, inverse))
+
+
+def unscaled(deviations: Deviations) -> Deviations:
+    """Return deviations of which all bends have the scale one."""
+    return replace(
+        deviations,
+        rigid_scale=np.ones_like(deviations.rigid_scale),
+        own_scale=np.ones_like(deviations.own_scale),
+    )
+
+
+def bend_scales(space: StateSpace, share: Floats) -> dict[str, Floats]:
+    """Return the scales of bends that are expected, by their names in `Deviations`, for E[w^2] (bend, state).
+
+    `share` is E[w^2] over the variance at scale one.
+    """
+    rigid = space.group < space.rigid
+    return {
+        "rigid_scale": _expected(share[:, rigid, None], RIGID_FREEDOM),
+        "own_scale": _expected(share[:, ~rigid], FREEDOM),
+    }
 
 
 def _slope(squares: Floats, variance: Floats) -> Floats:

@@ -221,7 +221,7 @@ class _Protocol:
     def _remove_pattern(self, basis: SectionBasis, found: _Found) -> None:
         """Take the detector's fixed pattern from all images of scale 1, if the options say so and noise is known."""
         fine = self.prepared[1]
-        noise = noise_of(self._setup, fine)
+        noise = noise_of(self._setup, fine.systematic)
         if not self._setup.options.remove_pattern or noise is None:
             return
         known: Noise = noise
@@ -245,7 +245,7 @@ class _Protocol:
     def noise(self, equations: Equations) -> Noise:
         """Return the noise of all images at scale 1; where the detector's is not stated, what the residual tells."""
         fine = self.prepared[1]
-        noise = noise_of(self._setup, fine) or known_from_residual(
+        noise = noise_of(self._setup, fine.systematic) or known_from_residual(
             equations.rms, fine.systematic.shape, fine.systematic.detector, self._setup.options.smooth_px
         )
         return noise if self._flats_left is None else replace(noise, flat=noise.flat * self._flats_left)

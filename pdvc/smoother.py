@@ -41,6 +41,7 @@ from pdvc.history import Angle, Polynomial, TimeFunction, time_basis
 from pdvc.noise import Propagated
 from pdvc.process import FITTED_MODES, ROUNDS, Process, Seen, Smoothed
 from pdvc.projection import BlockVectors
+from pdvc.sections import SectionBasis
 from pdvc.solution import SHORTER, Known, Problem, Solution, Solver
 from pdvc.state_space import Deviations, StateSpace
 from pdvc.verdict import Stop, listed
@@ -117,7 +118,12 @@ class Smoother(Solver):
             raise ValueError("solver: expected kind = 'smoother' in the last stage, at scale 1, got it in another one")
         steps, shape = len(problem.series), problem.start.shape[1:]
         amplitude = problem.start.reshape(steps, -1) * np.sqrt(steps)
-        spaces = self._space(problem, FITTED_MODES), self._space(problem, None)
+        trend = time_basis(self.trend, problem.series) if self.trend else np.empty((0, steps))
+        prior = float(problem.prior.deviation_voxel.max())
+        few, all_modes = (
+            self.space(problem.basis, problem.series.time_s, trend, prior, modes) for modes in (FITTED_MODES, None)
+        )
+        spaces = few, all_modes
         equations = problem.linearise(amplitude.reshape(steps, *shape))
         slow = slow_functions(problem)
         noise = problem.noise_at(amplitude.reshape(steps, *shape), equations, slow)
@@ -164,15 +170,17 @@ class Smoother(Solver):
         """Return about how many passes over all radiographs it may take."""
         return self.most_passes * 0.6 + 3
 
-    def _space(self, problem: Problem, most_modes: int | None) -> StateSpace:
-        """Return the states of a problem."""
-        steps = len(problem.series)
+    def space(
+        self, basis: SectionBasis, time_s: Floats, trend: Floats, prior_voxel: float, most_modes: int | None
+    ) -> StateSpace:
+        """Return the states of steps at times (step,), with a trend (function, step), as this solver takes them."""
+        tied = self.contraction_of_strain
         return StateSpace(
-            problem.basis,
-            problem.series.time_s,
-            time_basis(self.trend, problem.series) if self.trend else np.empty((0, steps)),
-            contraction_of_strain=None if self.contraction_of_strain == "none" else self.contraction_of_strain,
-            prior_voxel=float(problem.prior.deviation_voxel.max()),
+            basis,
+            time_s,
+            trend,
+            contraction_of_strain=None if tied == "none" else tied,
+            prior_voxel=prior_voxel,
             most_modes=most_modes,
         )
 

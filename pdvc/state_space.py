@@ -32,6 +32,7 @@ each motion.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -122,6 +123,14 @@ class StateSpace:
         self._gap = (gap[1:] + gap[:-1]) / 2
         self.ends = np.unique([0, len(time_s) - 1])
         """The first and the last step."""
+
+    def within(self, steps: slice) -> StateSpace:
+        """Return the states of some steps that follow each other, by themselves."""
+        part, bends = copy(self), slice(steps.start, max(steps.stop - 2, steps.start))
+        part.trend = self.trend[steps]
+        part.second_differences, part._gap = self.second_differences[bends], self._gap[bends]
+        part.ends = np.unique([0, len(part.trend) - 1])
+        return part
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -290,11 +290,12 @@ def ended(one: Case, steps: int) -> Case:
 
 def test_a_filter_takes_no_more_steps_than_there_are():
     one = case(0, 2)
-    told, known = one.process.told(one.deviations), Filter(one.space, one.deviations)
+    told, known = one.process.told(one.deviations), Filter(one.space, one.space.end_variance(one.deviations))
+    bend = np.ones(one.space.shape[1])
     for t in range(2):
-        known.add(told.information[t], told.vector[t])
+        known.add(told.information[t], told.vector[t][:, None], bend)
     with pytest.raises(ValueError, match="step: expected at most 2"):
-        known.add(told.information[0], told.vector[0])
+        known.add(told.information[0], told.vector[0][:, None], bend)
 
 
 class Caught(Exception):

@@ -83,7 +83,7 @@ def _bound(experiment: Experiment, truth: TruePoints, options: MeasureOptions, p
     setup = set_up(experiment, options, progress=progress)
     basis, time_functions = setup.sections, setup.time_functions()
     prepared = prepare(setup, 1, progress)
-    noise = stated_noise(setup, prepared)
+    noise, _ = stated_noise(setup, prepared.systematic)
     voxel_mm = experiment.geometry.voxel_mm
     coefficients, _ = true_coefficients(basis, time_functions, voxel_mm, truth)
     amplitude = np.einsum("ft,fjk->tjk", time_functions, coefficients)

@@ -1,0 +1,254 @@
+"""A filter over steps that go on, of a process whose scales are known the better the more steps came after.
+
+How large a bend, an apparent motion or a misfit of a step was (`pdvc.state_space`), the steps after it tell best: a
+slip looks like noise at first. So the scales of the last `WINDOW` steps are found anew with each step, from few modes,
+and the filter (`pdvc.filtering`) goes again over the last `LAG` of them. Other deviations are fitted now and then.
+
+Before a step is taken in, the motion is sought in passes over its radiograph. Each gives what it tells of the states,
+J and v, to be weighed against what is expected: x_p of covariance P, without a bend. With the bend w and its factor c,
+
+    x = x_p + w / c + N(0, P)        w given J', v':  precision  M / c^2 + Q^-1,   M = (1 + J' P)^-1 J'
+
+whose scale s in Q = s Q_1 is found in turn with w, so that a slip is followed in the radiograph that shows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.apparent import reduced
+from pdvc.filtering import Filter, bends_to
+from pdvc.process import Process, Seen, bend_scales, unscaled
+from pdvc.state_space import Deviations, StateSpace
+
+Floats = NDArray[np.float64]
+
+WINDOW = 40
+"""Steps whose scales are found anew at each step."""
+LAG = 20
+"""Steps that the filter goes over again."""
+FITTED = 64
+"""Steps from which deviations are fitted, at most."""
+EVERY = 16
+"""Steps after which deviations are fitted anew."""
+ROUNDS = 4
+"""Times that the scales of a bend are found in turn with the bend."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """What a radiograph told: white data y = X a + noise, and what errors that steps have in common add to y."""
+
+    design: Floats
+    """X (unknown, unknown)."""
+    data: Floats
+    """y (unknown,)."""
+    errors: Floats
+    """(unknown, error)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Expected:
+    """What is expected of the states of a step before its radiograph, were there no bend."""
+
+    step: int
+    mean: Floats
+    """x_p (state,)."""
+    covariance: Floats
+    """P (state, state)."""
+
+
+class Late(ValueError):
+    """A step that the filter has left behind."""
+
+
+class LaggedFilter:
+    """What is known of each step from the steps so far, in any order within `LAG` of the newest."""
+
+    def __init__(self, space: StateSpace, few: StateSpace, bend_voxel: float | Literal["fit"], errors: int) -> None:
+        """Begin before the first step of a planned test.
+
+        `space`, and the same with `few` modes, in which scales are found; `bend_voxel` as in `pdvc.smoother`; the
+        number of errors that steps have in common.
+        """
+        self.space, self._few = space, few
+        self._finds = bend_voxel == "fit"
+        self._deviations = space.first_guess() if bend_voxel == "fit" else space.fixed(bend_voxel)
+        self._told: dict[int, Told] = {}
+        self._fitted = 0
+        self.steps = 0
+        """Steps so far: up to the newest one that told something."""
+        start = Filter(space, space.end_variance(self._deviations), errors)
+        self._passed = [start]
+        """The filter before the steps that it goes over again, and after each of them, as far as it has gone."""
+
+    def expected(self, step: int) -> Expected:
+        """Return what is expected of a step; raises Late where it is more than `LAG` steps ago."""
+        mean, covariance = self._after(step).ahead()
+        return Expected(step=step, mean=mean[:, 0], covariance=covariance)
+
+    def weighed(self, expected: Expected, matrix: Floats, vector: Floats) -> tuple[Floats, Floats]:
+        """Return mean (unknown,) and covariance (unknown, unknown) of a step's amplitudes, voxels.
+
+        From what is expected and from what one pass tells: B (unknown, unknown) and c + B a (unknown,), over the
+        variance of the noise. Scales are found on the way, and forgotten.
+        """
+        to, step = self.space.to_amplitude, expected.step
+        apparent = self.space.apparent_variance(self._deviations)[step]
+        told = reduced((to.T @ matrix @ to)[None], (to.T @ vector)[None], apparent[None])
+        information, left = told.information[0], told.vector[0] - told.information[0] @ expected.mean
+        spread = expected.covariance + np.diag(self._bend(expected, information, left))
+        gain = np.linalg.solve(np.eye(len(spread)) + spread @ information, spread)
+        return to @ (expected.mean + gain @ left), to @ gain @ to.T
+
+    def add(self, step: int, told: Told) -> None:
+        """Take in what the radiograph of a step told; raises Late where it is more than `LAG` steps ago."""
+        self._after(step)
+        self._told[step] = told
+        self.steps = max(self.steps, step + 1)
+        if self._finds:
+            window = slice(max(self.steps - WINDOW, 0), self.steps)
+            process, given = self._process(window)
+            # nothing was known of a step before its radiograph
+            given.misfit[step - window.start] = 1
+            self._deviations = _with_scales(self._deviations, process.rescaled(given), window)
+        self._passed = self._passed[:1]
+        self._passed = [self._after(max(self.steps - LAG, self._first))]
+        self._told = {t: each for t, each in self._told.items() if t >= self.steps - FITTED}
+
+    def at(self, step: int) -> tuple[Floats, Floats]:
+        """Return a step's amplitudes and what errors in common do to them (unknown, 1 + error), and their covariance.
+
+        From the steps up to it, voxels and voxel^2; raises Late where it is more than `LAG` steps ago.
+        """
+        mean, covariance = self._after(step + 1).now()
+        to = self.space.to_amplitude
+        return to @ mean, to @ covariance @ to.T
+
+    def fit(self) -> bool:
+        """Fit the deviations where it is time to; return whether it was. It takes as long as some steps."""
+        if not self._finds or self.steps < self._fitted + EVERY:
+            return False
+        self._fitted = self.steps
+        process, given = self._process(slice(max(self.steps - FITTED, 0), self.steps))
+        found = process.fitted(given, 1)
+        # the ends of a window are not those of the test
+        self._deviations = replace(
+            self._deviations,
+            bend_voxel=found.bend_voxel,
+            roughness=found.roughness,
+            apparent_voxel=found.apparent_voxel,
+        )
+        self._passed = self._passed[:1]
+        return True
+
+    def kept(self) -> dict[str, NDArray[Any]]:
+        """Return all that it has to know to go on, but for what the last `FITTED` steps told."""
+        start = self._passed[0]
+        return {
+            **vars(self._deviations),
+            "matrix": start.matrix,
+            "vectors": start.vectors,
+            "count": np.array([start.steps, self.steps, self._fitted]),
+        }
+
+    def restore(self, kept: Mapping[str, NDArray[Any]], told: Mapping[int, Told]) -> None:
+        """Go on from what `kept` returned, and from what steps told, those of the last `FITTED` at least."""
+        first, self.steps, self._fitted = kept["count"].tolist()
+        self._deviations = Deviations(**{name: kept[name] for name in vars(self._deviations)})
+        self._told = {step: told[step] for step in sorted(told) if self.steps - FITTED <= step < self.steps}
+        start = self._passed[0].copied()
+        start.steps, start.matrix, start.vectors = first, kept["matrix"], kept["vectors"]
+        self._passed = [start]
+
+    @property
+    def _first(self) -> int:
+        """Return the first step that the filter goes over again."""
+        return self._passed[0].steps
+
+    def _after(self, step: int) -> Filter:
+        """Return the filter before a step, after all those before it."""
+        if step < self._first:
+            raise Late(f"step {step}: expected step {self._first} or a later one, the filter is past the others")
+        if step > self._passed[-1].steps:
+            space, bends = self.space, bends_to(self.space, self._deviations)
+            apparent = space.apparent_variance(self._deviations)
+            for t in range(self._passed[-1].steps, step):
+                known = self._passed[-1].copied()
+                known.add(*self._informed(t, apparent[t]), bends[t])
+                self._passed.append(known)
+        return self._passed[step - self._first]
+
+    def _informed(self, step: int, apparent: Floats) -> tuple[Floats, Floats]:
+        """Return J' (state, state) and v' (state, 1 + error) of a step; zeros where there is no radiograph."""
+        states = self.space.shape[1]
+        if step not in self._told:
+            return np.zeros((states, states)), np.zeros((states, self._passed[0].errors + 1))
+        told, misfit = self._told[step], self._deviations.misfit[step]
+        design = told.design @ self.space.to_amplitude
+        vectors = design.T @ np.column_stack([told.data, told.errors]) / misfit
+        found = reduced((design.T @ design / misfit)[None], vectors[None, :, 0], apparent[None])
+        return found.information[0], found.of(vectors[None])[0]
+
+    def _bend(self, expected: Expected, information: Floats, left: Floats) -> Floats:
+        """Return the variance (state,) that the bend of a step adds to what is expected, as large as the step shows.
+
+        From J' and v' - J' x_p. The first two steps end no bend.
+        """
+        space, bend = self.space, expected.step - 2
+        if bend < 0:
+            return np.zeros(len(left))
+        three = slice(bend, bend + 3)
+        space, deviations = space.within(three), _within(self._deviations, three)
+        factor, once = space.second_differences[0, 2], space.bend_variance(unscaled(deviations))
+        if self._finds:
+            both = np.column_stack([information, left])
+            known = np.linalg.solve(np.eye(len(left)) + information @ expected.covariance, both)
+            matrix, vector = known[:, :-1] / factor**2, known[:, -1] / factor
+            for _ in range(ROUNDS):
+                covariance = np.linalg.inv(matrix + np.diag(1 / space.bend_variance(deviations)[0]))
+                squares = (covariance @ vector) ** 2 + np.diag(covariance)
+                deviations = replace(deviations, **bend_scales(space, squares / once))
+        return np.asarray(space.bend_variance(deviations)[0] / factor**2)
+
+    def _process(self, window: slice) -> tuple[Process, Deviations]:
+        """Return the process of some steps, in few modes, about where its first step may be; and its deviations."""
+        space = self._few.within(window)
+        steps, unknowns = space.shape[0], len(space.to_amplitude)
+        design, data = np.zeros((steps, unknowns, unknowns)), np.zeros((steps, unknowns))
+        about = np.zeros(unknowns)
+        if self._first:
+            about = self.space.to_amplitude @ self._passed[0].now()[0][:, 0]
+        for step, told in self._told.items():
+            if window.start <= step < window.stop:
+                design[step - window.start] = told.design
+                data[step - window.start] = told.data - told.design @ about
+        given = _within(self._deviations, window)
+        wide = np.full_like(given.end_voxel, space.prior_voxel)
+        return Process(space, Seen(design=design, data=data)), replace(given, end_voxel=wide)
+
+
+def _within(deviations: Deviations, window: slice) -> Deviations:
+    """Return the deviations of some steps, arrays of their own."""
+    bends = slice(window.start, max(window.stop - 2, window.start))
+    return replace(
+        deviations,
+        rigid_scale=deviations.rigid_scale[bends].copy(),
+        own_scale=deviations.own_scale[bends].copy(),
+        misfit=deviations.misfit[window].copy(),
+        apparent_scale=deviations.apparent_scale[window].copy(),
+    )
+
+
+def _with_scales(deviations: Deviations, found: Deviations, window: slice) -> Deviations:
+    """Return deviations with the scales that were found for some steps."""
+    whole = _within(deviations, slice(0, len(deviations.misfit)))
+    bends = slice(window.start, max(window.stop - 2, window.start))
+    whole.rigid_scale[bends], whole.own_scale[bends] = found.rigid_scale, found.own_scale
+    whole.misfit[window], whole.apparent_scale[window] = found.misfit, found.apparent_scale
+    return whole

@@ -1,0 +1,219 @@
+"""The motion at each step from the radiographs so far, while the test goes on.
+
+A radiograph that arrives is worked on as in `pdvc.protocol`, by itself: from where the filter (`pdvc.lagged`) expects
+the sample, coarse to fine, each pass weighed against what is expected; at scale 1 with the noise V of its images, in
+which the filter then takes it in. The detector's fixed pattern is taken from it as far as the radiographs before it
+tell (`pdvc.pattern`).
+
+Steps have errors in common: those of the flats, and of e, believed to a share. Draws of them go through the filter
+beside the data, and the covariance of what comes out is added to what the filter knows. It holds what they do to each
+step alone a second time: intervals are rather too wide than too narrow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from pdvc.equations import Equations, linearise
+from pdvc.experiment import Series
+from pdvc.lagged import LaggedFilter, Told
+from pdvc.measurement import ResidualTests
+from pdvc.noise import BELIEF, Noise, StepNoise, meeting_noise, registered_left, weighted_sensitivities
+from pdvc.pattern import GrowingPattern, Pattern
+from pdvc.preparation import Prepared, at_rest, radiograph_noise, stated_noise, with_radiographs
+from pdvc.process import FITTED_MODES
+from pdvc.progress import Progress, silent
+from pdvc.residual_tests import residual_tests
+from pdvc.sensitivity_sums import adjoint, adjoints
+from pdvc.setup import Setup
+from pdvc.smoother import Smoother, seen
+from pdvc.state_space import StateSpace
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+DRAWS = 24
+"""Draws of the flats' noise that go along."""
+MOST_PASSES = 3
+"""Passes over one radiograph at one scale, at most."""
+COARSE_CHANGE = 0.1
+"""Rms change of the amplitudes, over the pixel of a coarse scale, under which the next scale begins."""
+LEAST_CHANGE = 0.2
+"""The same at scale 1, over their standard deviations, under which a pass was the last one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Radiograph:
+    """One radiograph of the test and what was recorded with it."""
+
+    step: int
+    """Its place in the planned test, counted from 0."""
+    counts: NDArray[np.uint16]
+    """Counts (row, column)."""
+    angle_rad: float
+    time_s: float
+    force_N: float
+
+    def series(self) -> Series:
+        """Return a stack of it alone."""
+        return Series(
+            counts=self.counts[None],
+            angle_rad=np.array([self.angle_rad]),
+            time_s=np.array([self.time_s]),
+            force_N=np.array([self.force_N]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taken:
+    """What became of a radiograph: the motion at its step, from the radiographs up to it."""
+
+    amplitude: Floats
+    """(section, motion), voxels."""
+    covariance: Floats
+    """(section * motion, the same), voxel^2."""
+    told: Told
+    residual: Image
+    """rho (row, column) over the window, grey levels, at the last pass."""
+    tests: ResidualTests
+    """Whether it is the noise that was expected."""
+    passes: int
+    """Passes over the radiograph, of all scales."""
+
+
+class Tracker:
+    """Follows a test of which angles and times are planned, from radiographs in nearly any order."""
+
+    def __init__(self, setup: Setup, progress: Progress = silent) -> None:
+        """Make ready what the reference scan tells; raises ValueError where a test cannot be followed step by step."""
+        solver = setup.options.deformation[-1].solver
+        if not isinstance(solver, Smoother):
+            raise ValueError(
+                f"deformation: expected kind = 'smoother' in the last stage, to follow a test, got {solver.kind!r}"
+            )
+        self._setup, self._basis = setup, setup.sections
+        self._rest = {scale: at_rest(setup, scale, progress) for scale in setup.options.scales}
+        self._noise, self._detector = stated_noise(setup, self._rest[1].systematic)
+        self._blurred = meeting_noise(self._rest[1].volume, self._noise.smooth_px)
+        self._pattern = GrowingPattern(self._rest[1].systematic, self._noise)
+        self._flats = _draws(self._noise)
+        space, few = _space(setup, solver, None), _space(setup, solver, FITTED_MODES)
+        self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS)
+
+    def take(self, radiograph: Radiograph) -> Taken:
+        """Take in a radiograph; raises Late of `pdvc.lagged` where its step is too far behind the newest."""
+        # products of small matrices: two threads would wait for each other most of the time
+        with threadpool_limits(limits=1, user_api="blas"):
+            return self._take(radiograph)
+
+    def settle(self) -> bool:
+        """Fit what the process is like, where it is time to; return whether it was. Best between radiographs."""
+        with threadpool_limits(limits=1, user_api="blas"):
+            return self._known.fit()
+
+    def kept(self) -> dict[str, NDArray[Any]]:
+        """Return all that has to be known to go on, but for what the last `FITTED` of `pdvc.lagged` steps told."""
+        return {**self._known.kept(), "pattern": self._pattern.sums, "pattern_steps": np.array(self._pattern.steps)}
+
+    def restore(self, kept: Mapping[str, NDArray[Any]], told: Mapping[int, Told]) -> None:
+        """Go on from what `kept` returned, and from what steps told."""
+        self._known.restore(kept, told)
+        self._pattern.sums, self._pattern.steps = np.array(kept["pattern"]), int(kept["pattern_steps"])
+
+    def _take(self, radiograph: Radiograph) -> Taken:
+        pattern = self._pattern.found() if self._setup.options.remove_pattern else None
+        images = self._images(radiograph, pattern)
+        fine, noise = images[1], self._noise_of(radiograph, pattern)
+        amplitude, equations, passes = self._approached(images, radiograph.step)
+        told, image = self._told_by(fine, amplitude, equations, noise)
+        self._known.add(radiograph.step, told)
+        found, covariance = self._known.at(radiograph.step)
+        together = found[:, 1:] / np.sqrt([1, *[DRAWS] * DRAWS])
+        residual = equations.residual[0]
+        if pattern is not None:
+            self._pattern.add(residual, pattern.grey[fine.systematic.window], image.image)
+        return Taken(
+            amplitude=found[:, 0].reshape(self._basis.shape),
+            covariance=covariance + together @ together.T,
+            told=told,
+            residual=residual,
+            tests=residual_tests(
+                fine.images, fine.systematic, self._basis, amplitude, noise, equations.residual, amplitude.size
+            ),
+            passes=passes,
+        )
+
+    def _images(self, radiograph: Radiograph, pattern: Pattern | None) -> dict[int, Prepared]:
+        """Return a radiograph at each scale, the coarsest first."""
+        alone = radiograph.series()
+        images = {scale: with_radiographs(self._setup, rest, alone) for scale, rest in self._rest.items()}
+        if pattern is not None:
+            images[1] = images[1].without(pattern.grey)
+        return images
+
+    def _noise_of(self, radiograph: Radiograph, pattern: Pattern | None) -> Noise:
+        """Return the noise of a radiograph, as that of step 0, of the views and of the flats."""
+        own = radiograph_noise(self._setup, self._rest[1].systematic, self._detector, radiograph.counts)
+        flat = self._noise.flat if pattern is None else self._noise.flat * pattern.left
+        return replace(self._noise, step=lambda _: own, flat=flat)
+
+    def _approached(self, images: Mapping[int, Prepared], step: int) -> tuple[Floats, Equations, int]:
+        """Return amplitudes (1, section, motion), voxels, the equations there at scale 1, and the number of passes."""
+        expected, passes = self._known.expected(step), 0
+        at = self._known.space.to_amplitude @ expected.mean
+        for scale, prepared in images.items():
+            for _ in range(MOST_PASSES):
+                equations = linearise(prepared.images, self._basis, at.reshape(1, *self._basis.shape))
+                passes += 1
+                variance = float(prepared.noise_rms or 1) ** 2
+                matrix, vector = equations.matrix[0] / variance, equations.vector[0] / variance
+                mean, covariance = self._known.weighed(expected, matrix, vector + matrix @ at)
+                size = LEAST_CHANGE * np.sqrt(np.diag(covariance)) if scale == 1 else COARSE_CHANGE * scale
+                change = float(np.sqrt(np.mean(((mean - at) / size) ** 2)))
+                # what the last pass tells is taken in where it was linearised
+                if scale == 1 and (change < 1 or passes == MOST_PASSES * len(images)):
+                    break
+                at = mean
+                if change < 1:
+                    break
+        return at.reshape(1, *self._basis.shape), equations, passes
+
+    def _told_by(
+        self, fine: Prepared, amplitude: Floats, equations: Equations, noise: Noise
+    ) -> tuple[Told, StepNoise]:
+        """Return what a radiograph told about amplitudes (1, section, motion), and what its noise meets."""
+        images, systematic = replace(fine.images, volume=self._blurred), fine.systematic
+        unknowns, rays = amplitude.size, images.rays
+        sight = systematic.looked_along(slice(None), rays, self._basis, amplitude, images.voxel_mm)
+        weighted = weighted_sensitivities(images, self._basis, amplitude, [0])[0]
+        places = systematic.places(0, rays[0], self._basis, amplitude[0], images.voxel_mm)
+        meets = StepNoise.of(noise, 0, sight.of_step(0), weighted, places, systematic.corner)
+        covariance = np.sum(list(meets.own(noise.flat, unknowns).values()), axis=0)
+        left = registered_left(images, self._basis, amplitude, 0)
+        believed = np.zeros(unknowns) if left is None else BELIEF * adjoint(weighted, left, unknowns)
+        of_flats = adjoints(meets.shared, self._flats * np.sqrt(noise.flat)[..., None], unknowns)
+        data, white = seen(equations, covariance[None], amplitude.reshape(1, -1))
+        errors = white[0] @ np.column_stack([believed, of_flats])
+        return Told(design=data.design[0], data=data.data[0], errors=errors), meets
+
+
+def _draws(noise: Noise) -> Image:
+    """Return draws of unit variance for the flats (row, column, draw), the same for all steps."""
+    return np.random.default_rng(0).standard_normal((*noise.flat.shape, DRAWS), dtype=np.float32)
+
+
+def _space(setup: Setup, solver: Smoother, most_modes: int | None) -> StateSpace:
+    """Return the states of a planned test; its trend is a sine and a cosine of the planned angle."""
+    planned = setup.experiment.test
+    trend = (
+        np.stack([np.sin(planned.angle_rad), np.cos(planned.angle_rad)])
+        if solver.trend
+        else np.empty((0, len(planned)))
+    )
+    return solver.space(setup.sections, planned.time_s, trend, setup.options.prior_voxel, most_modes)
