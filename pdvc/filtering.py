@@ -59,11 +59,8 @@ class Filter:
         states, t = len(vectors), self.steps
         if t >= self._space.shape[0]:
             raise ValueError(f"step: expected at most {t}, as many as the state space has, got another one")
-        # the new state goes between the older ones and the trend
-        at = min(t, 2) * states
-        matrix = np.insert(np.insert(self.matrix, [at] * states, 0.0, axis=0), [at] * states, 0.0, axis=1)
-        both = np.insert(self.vectors, [at] * states, 0.0, axis=0)
-        new, trend, i = slice(at, at + states), self._space.trend[t], np.arange(states)
+        at, trend, i = min(t, 2) * states, self._space.trend[t], np.arange(states)
+        matrix, both = self._with_room(at, states)
         if t == 0:
             matrix[i, i] += self._end
         if t >= 2:
@@ -72,7 +69,7 @@ class Filter:
                 for m, other in enumerate(factors):
                     matrix[i + k * states, i + m * states] += one * other / bend_variance
         of_trend = information @ trend
-        rest = slice(at + states, None)
+        new, rest = slice(at, at + states), slice(at + states, None)
         matrix[new, new] += information
         matrix[new, rest] += of_trend
         matrix[rest, new] += of_trend.T
@@ -81,6 +78,17 @@ class Filter:
         both[rest] += trend.T @ vectors
         self.matrix, self.vectors = _without(matrix, both, states) if t >= 2 else (matrix, both)
         self.steps += 1
+
+    def _with_room(self, at: int, states: int) -> tuple[Floats, Floats]:
+        """Return information with room for a new state, between the older ones and the trend."""
+        size = len(self.matrix) + states
+        matrix, vectors = np.zeros((size, size)), np.zeros((size, self.vectors.shape[1]))
+        new, old = (slice(0, at), slice(at + states, None)), (slice(0, at), slice(at, None))
+        for to, rows in zip(new, old, strict=True):
+            vectors[to] = self.vectors[rows]
+            for across, columns in zip(new, old, strict=True):
+                matrix[to, across] = self.matrix[rows, columns]
+        return matrix, vectors
 
     def now(self) -> tuple[Floats, Floats]:
         """Return means (state, 1 + error) and covariance (state, state) of the last step's states, trend included."""

@@ -36,8 +36,13 @@ FITTED = 64
 """Steps from which deviations are fitted, at most."""
 EVERY = 16
 """Steps after which deviations are fitted anew."""
+CHANGED = 0.2
+"""Change of a step's scales, of their logarithm, from which on the filter goes over it again."""
 ROUNDS = 4
 """Times that the scales of a bend are found in turn with the bend."""
+
+
+_USED = "used_"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,9 +88,10 @@ class LaggedFilter:
         self._fitted = 0
         self.steps = 0
         """Steps so far: up to the newest one that told something."""
-        start = Filter(space, space.end_variance(self._deviations), errors)
-        self._passed = [start]
-        """The filter before the steps that it goes over again, and after each of them, as far as it has gone."""
+        self._passed = [Filter(space, space.end_variance(self._deviations), errors)]
+        """The filter before the steps that it may go over again, and after each of them, as far as it has gone."""
+        self._variances = _variances(space, self._deviations)
+        """Those with which it went over each step."""
 
     def expected(self, step: int) -> Expected:
         """Return what is expected of a step; raises Late where it is more than `LAG` steps ago."""
@@ -99,7 +105,7 @@ class LaggedFilter:
         variance of the noise. Scales are found on the way, and forgotten.
         """
         to, step = self.space.to_amplitude, expected.step
-        apparent = self.space.apparent_variance(self._deviations)[step]
+        apparent = self._variances.apparent[step]
         told = reduced((to.T @ matrix @ to)[None], (to.T @ vector)[None], apparent[None])
         information, left = told.information[0], told.vector[0] - told.information[0] @ expected.mean
         spread = expected.covariance + np.diag(self._bend(expected, information, left))
@@ -110,15 +116,16 @@ class LaggedFilter:
         """Take in what the radiograph of a step told; raises Late where it is more than `LAG` steps ago."""
         self._after(step)
         self._told[step] = told
+        self._passed = self._passed[: step - self._first + 1]
         self.steps = max(self.steps, step + 1)
         if self._finds:
             window = slice(max(self.steps - WINDOW, 0), self.steps)
             process, given = self._process(window)
             # nothing was known of a step before its radiograph
             given.misfit[step - window.start] = 1
-            self._deviations = _with_scales(self._deviations, process.rescaled(given), window)
-        self._passed = self._passed[:1]
-        self._passed = [self._after(max(self.steps - LAG, self._first))]
+            self._adopt(_with_scales(self._deviations, process.rescaled(given), window))
+        self._after(self.steps)
+        self._passed = self._passed[max(self.steps - LAG - self._first, 0) :]
         self._told = {t: each for t, each in self._told.items() if t >= self.steps - FITTED}
 
     def at(self, step: int) -> tuple[Floats, Floats]:
@@ -138,13 +145,8 @@ class LaggedFilter:
         process, given = self._process(slice(max(self.steps - FITTED, 0), self.steps))
         found = process.fitted(given, 1)
         # the ends of a window are not those of the test
-        self._deviations = replace(
-            self._deviations,
-            bend_voxel=found.bend_voxel,
-            roughness=found.roughness,
-            apparent_voxel=found.apparent_voxel,
-        )
-        self._passed = self._passed[:1]
+        shared = {name: getattr(found, name) for name in ("bend_voxel", "roughness", "apparent_voxel")}
+        self._adopt(replace(self._deviations, **shared))
         return True
 
     def kept(self) -> dict[str, NDArray[Any]]:
@@ -152,6 +154,7 @@ class LaggedFilter:
         start = self._passed[0]
         return {
             **vars(self._deviations),
+            **{_USED + name: values for name, values in vars(self._variances).items()},
             "matrix": start.matrix,
             "vectors": start.vectors,
             "count": np.array([start.steps, self.steps, self._fitted]),
@@ -165,6 +168,7 @@ class LaggedFilter:
         start = self._passed[0].copied()
         start.steps, start.matrix, start.vectors = first, kept["matrix"], kept["vectors"]
         self._passed = [start]
+        self._variances = _Variances(**{name: kept[_USED + name] for name in vars(self._variances)})
 
     @property
     def _first(self) -> int:
@@ -175,25 +179,33 @@ class LaggedFilter:
         """Return the filter before a step, after all those before it."""
         if step < self._first:
             raise Late(f"step {step}: expected step {self._first} or a later one, the filter is past the others")
-        if step > self._passed[-1].steps:
-            space, bends = self.space, bends_to(self.space, self._deviations)
-            apparent = space.apparent_variance(self._deviations)
-            for t in range(self._passed[-1].steps, step):
-                known = self._passed[-1].copied()
-                known.add(*self._informed(t, apparent[t]), bends[t])
-                self._passed.append(known)
+        for t in range(self._passed[-1].steps, step):
+            known = self._passed[-1].copied()
+            known.add(*self._informed(t), self._variances.bend[t])
+            self._passed.append(known)
         return self._passed[step - self._first]
 
-    def _informed(self, step: int, apparent: Floats) -> tuple[Floats, Floats]:
+    def _informed(self, step: int) -> tuple[Floats, Floats]:
         """Return J' (state, state) and v' (state, 1 + error) of a step; zeros where there is no radiograph."""
         states = self.space.shape[1]
         if step not in self._told:
             return np.zeros((states, states)), np.zeros((states, self._passed[0].errors + 1))
-        told, misfit = self._told[step], self._deviations.misfit[step]
+        told, misfit = self._told[step], self._variances.misfit[step]
         design = told.design @ self.space.to_amplitude
         vectors = design.T @ np.column_stack([told.data, told.errors]) / misfit
+        apparent = self._variances.apparent[step]
         found = reduced((design.T @ design / misfit)[None], vectors[None, :, 0], apparent[None])
         return found.information[0], found.of(vectors[None])[0]
+
+    def _adopt(self, deviations: Deviations) -> None:
+        """Take over deviations; the filter will go again from the first step for which they have changed."""
+        self._deviations = deviations
+        now, before = _variances(self.space, deviations), self._variances
+        passed = slice(self._first, self._passed[-1].steps)
+        changed = np.flatnonzero(now.differs(before)[passed])
+        kept = self._first + int(changed[0]) if len(changed) else passed.stop
+        self._passed = self._passed[: kept - self._first + 1]
+        self._variances = before.then(now, kept)
 
     def _bend(self, expected: Expected, information: Floats, left: Floats) -> Floats:
         """Return the variance (state,) that the bend of a step adds to what is expected, as large as the step shows.
@@ -231,6 +243,43 @@ class LaggedFilter:
         given = _within(self._deviations, window)
         wide = np.full_like(given.end_voxel, space.prior_voxel)
         return Process(space, Seen(design=design, data=data)), replace(given, end_voxel=wide)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Variances:
+    """Variances of steps, as the filter takes them."""
+
+    bend: Floats
+    """Of the bend that ends at a step (step, state), voxel^2."""
+    apparent: Floats
+    """(step, state), voxel^2."""
+    misfit: Floats
+    """(step,)"""
+
+    def differs(self, other: _Variances) -> NDArray[np.bool_]:
+        """Return which steps have others by more than `CHANGED` (step,)."""
+        least = np.finfo(float).tiny
+        pairs = (
+            (self.bend, other.bend),
+            (self.apparent, other.apparent),
+            (self.misfit[:, None], other.misfit[:, None]),
+        )
+        away = [np.abs(np.log((one + least) / (two + least))).max(axis=1) for one, two in pairs]
+        return np.asarray(np.max(away, axis=0) > CHANGED)
+
+    def then(self, other: _Variances, step: int) -> _Variances:
+        """Return these before a step, and others from it on."""
+        pairs = ((name, getattr(other, name)) for name in vars(self))
+        return _Variances(**{name: np.concatenate([getattr(self, name)[:step], new[step:]]) for name, new in pairs})
+
+
+def _variances(space: StateSpace, deviations: Deviations) -> _Variances:
+    """Return the variances of all steps."""
+    return _Variances(
+        bend=bends_to(space, deviations),
+        apparent=space.apparent_variance(deviations),
+        misfit=deviations.misfit,
+    )
 
 
 def _within(deviations: Deviations, window: slice) -> Deviations:

@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from pdvc.equations import Equations, linearise
 from pdvc.experiment import Series
+from pdvc.incoming import Arrival
 from pdvc.lagged import LaggedFilter, Told
 from pdvc.measurement import ResidualTests
 from pdvc.noise import BELIEF, Noise, StepNoise, meeting_noise, registered_left, weighted_sensitivities
@@ -46,28 +47,6 @@ COARSE_CHANGE = 0.1
 """Rms change of the amplitudes, over the pixel of a coarse scale, under which the next scale begins."""
 LEAST_CHANGE = 0.2
 """The same at scale 1, over their standard deviations, under which a pass was the last one."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Radiograph:
-    """One radiograph of the test and what was recorded with it."""
-
-    step: int
-    """Its place in the planned test, counted from 0."""
-    counts: NDArray[np.uint16]
-    """Counts (row, column)."""
-    angle_rad: float
-    time_s: float
-    force_N: float
-
-    def series(self) -> Series:
-        """Return a stack of it alone."""
-        return Series(
-            counts=self.counts[None],
-            angle_rad=np.array([self.angle_rad]),
-            time_s=np.array([self.time_s]),
-            force_N=np.array([self.force_N]),
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +85,7 @@ class Tracker:
         space, few = _space(setup, solver, None), _space(setup, solver, FITTED_MODES)
         self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS)
 
-    def take(self, radiograph: Radiograph) -> Taken:
+    def take(self, radiograph: Arrival) -> Taken:
         """Take in a radiograph; raises Late of `pdvc.lagged` where its step is too far behind the newest."""
         # products of small matrices: two threads would wait for each other most of the time
         with threadpool_limits(limits=1, user_api="blas"):
@@ -126,7 +105,7 @@ class Tracker:
         self._known.restore(kept, told)
         self._pattern.sums, self._pattern.steps = np.array(kept["pattern"]), int(kept["pattern_steps"])
 
-    def _take(self, radiograph: Radiograph) -> Taken:
+    def _take(self, radiograph: Arrival) -> Taken:
         pattern = self._pattern.found() if self._setup.options.remove_pattern else None
         images = self._images(radiograph, pattern)
         fine, noise = images[1], self._noise_of(radiograph, pattern)
@@ -149,15 +128,20 @@ class Tracker:
             passes=passes,
         )
 
-    def _images(self, radiograph: Radiograph, pattern: Pattern | None) -> dict[int, Prepared]:
+    def _images(self, radiograph: Arrival, pattern: Pattern | None) -> dict[int, Prepared]:
         """Return a radiograph at each scale, the coarsest first."""
-        alone = radiograph.series()
+        alone = Series(
+            counts=radiograph.counts[None],
+            angle_rad=np.array([radiograph.angle_rad]),
+            time_s=np.array([radiograph.time_s]),
+            force_N=np.array([radiograph.force_N]),
+        )
         images = {scale: with_radiographs(self._setup, rest, alone) for scale, rest in self._rest.items()}
         if pattern is not None:
             images[1] = images[1].without(pattern.grey)
         return images
 
-    def _noise_of(self, radiograph: Radiograph, pattern: Pattern | None) -> Noise:
+    def _noise_of(self, radiograph: Arrival, pattern: Pattern | None) -> Noise:
         """Return the noise of a radiograph, as that of step 0, of the views and of the flats."""
         own = radiograph_noise(self._setup, self._rest[1].systematic, self._detector, radiograph.counts)
         flat = self._noise.flat if pattern is None else self._noise.flat * pattern.left

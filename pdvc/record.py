@@ -1,0 +1,141 @@
+"""The record of a test that is followed while it runs: a file to which a line of JSON is added for each radiograph.
+
+It is only ever added to, and each line is on the disk before the next radiograph is looked at, so that it survives
+whatever happens to the process, and anything may read it meanwhile. The first line tells what the others are about;
+`what` tells of each line which kind it is::
+
+    {"what": "test", "title": ..., "steps": 127, "height_mm": [...], "voxel_mm": 0.0107}
+    {"what": "step", "step": 0, "angle_deg": ..., "time_s": ..., "force_N": ..., "displacement_voxel": [[...], ...], ...}
+    {"what": "lost", "step": 4, "file": "00004.tif", "reason": "..."}
+    {"what": "measurement", "file": "motion.nc", "seconds": 312.0}
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """A line of a record; each kind is a subclass with its own `what`."""
+
+    what: ClassVar[str]
+
+    def text(self) -> str:
+        """Return the line, without its end."""
+        return json.dumps({"what": self.what, **asdict(self)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class TestLine(Line):
+    """What is followed: the first line."""
+
+    what: ClassVar[str] = "test"
+    title: str
+    steps: int
+    """Steps that are planned."""
+    height_mm: tuple[float, ...]
+    """Heights of the sections on the axis, mm."""
+    voxel_mm: float
+    """Voxel in which displacements are counted, mm."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepLine(Line):
+    """The motion at a step, from the radiographs up to it, with standard deviations."""
+
+    what: ClassVar[str] = "step"
+    step: int
+    file: str
+    angle_deg: float
+    time_s: float
+    force_N: float
+    displacement_voxel: tuple[tuple[float, float, float], ...]
+    """On the axis, at each section: across the beam, vertical, along the beam."""
+    displacement_std: tuple[tuple[float, float, float], ...]
+    strain: tuple[float, ...]
+    """Axial strain between neighbouring sections."""
+    strain_std: tuple[float, ...]
+    mean_strain: float
+    """Between the first section and the last."""
+    mean_strain_std: float
+    chi2_reduced: float
+    """Mean square of the residual over its expected variance: one if the motion explains the radiograph."""
+    passes: int
+    seconds: float
+    """From when the radiograph was found whole to when its motion was known."""
+    unix_s: float
+    """When that was, by the clock of the machine, s since 1970."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LostLine(Line):
+    """A radiograph that could not be used, and why."""
+
+    what: ClassVar[str] = "lost"
+    step: int
+    """-1 where it is not known."""
+    file: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasurementLine(Line):
+    """The measurement of the whole test, once it was over."""
+
+    what: ClassVar[str] = "measurement"
+    file: str
+    seconds: float
+
+
+_KINDS: dict[str, type[Line]] = {each.what: each for each in (TestLine, StepLine, LostLine, MeasurementLine)}
+
+
+class Record:
+    """A record that is being written."""
+
+    def __init__(self, path: Path) -> None:
+        """Go on with a record, or begin one; half a line, left by a process that was killed, is taken away."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("ab+")
+        self._file.seek(0)
+        whole = self._file.read()
+        end = whole.rfind(b"\n") + 1
+        self.lines = whole[:end].decode().splitlines()
+        """All lines, as text."""
+        if end < len(whole):
+            self._file.truncate(end)
+
+    def add(self, line: Line) -> None:
+        """Add a line, and wait until it is on the disk."""
+        self.add_text(line.text())
+
+    def add_text(self, text: str) -> None:
+        """Add a line by its text, as `Line.text` returns it."""
+        self._file.write(text.encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self.lines.append(text)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_record(path: Path) -> Iterator[Line]:
+    """Yield the whole lines of a record; raises ValueError where a line is none of a record."""
+    for number, text in enumerate(path.read_bytes().split(b"\n")[:-1], start=1):
+        try:
+            values: dict[str, Any] = json.loads(text)
+            yield _KINDS[values.pop("what")](**{key: _tuples(value) for key, value in values.items()})
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}, line {number}: expected a line of a record, got {text[:60]!r}: {error}") from None
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(each) for each in value) if isinstance(value, list) else value
