@@ -27,8 +27,8 @@ def play(
 ) -> None:
     """Play the test of an experiment folder into another one, radiograph by radiograph, as a scanner writes it.
 
-    Each radiograph becomes a TIFF of its own, and then a line of FOLDER/radiographs.csv. A radiograph that was late
-    delays none of those after it.
+    Each radiograph becomes a TIFF of its own, and then a line of FOLDER/radiographs.csv. One that is late delays none
+    of those after it.
 
     Example:  `pdvc-bench play out/quick/experiment --to out/arriving`
     """
