@@ -182,5 +182,5 @@ def _tiff(counts: NDArray[np.uint16]) -> memoryview:
     if counts.ndim != 2 or counts.dtype.newbyteorder("=") != np.uint16:
         raise ValueError(f"expected uint16 counts (row, column), given {counts.dtype} of shape {counts.shape}")
     buffer = io.BytesIO()
-    tifffile.imwrite(buffer, counts.astype(np.uint16), photometric="minisblack")
+    tifffile.imwrite(buffer, counts)
     return buffer.getbuffer()

@@ -81,7 +81,7 @@ def read_radiograph(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
             found = tuple(page.shape) if len(tiff.pages) == 1 else (len(tiff.pages), *page.shape)
             if found != size:
                 raise ExperimentError(f"{path}: expected one image {size} as in {DESCRIPTION}, found {found}")
-            return np.ascontiguousarray(page.asarray(), dtype=np.uint16)
+            return page.asarray()
     except ExperimentError:
         raise
     except FileNotFoundError:
