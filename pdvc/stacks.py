@@ -1,8 +1,9 @@
-"""Stacks of counts in TIFF files: written image by image, read where they are, and refused in one line."""
+"""Counts in TIFF files: stacks, written image by image and read where they are; radiographs; refused in one line."""
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +20,10 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what it compl
 
 class ExperimentError(ValueError):
     """A file of an experiment folder is wrong: which, what was expected and what was found."""
+
+
+class UnfinishedError(ExperimentError):
+    """A file is not there, shorter than it says, or cannot be opened, as while it is being written."""
 
 
 def read_stack(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
@@ -41,8 +46,7 @@ def read_stack(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
             if declared is not None and declared != found and declared != len(series):
                 raise ExperimentError(f"{path}: truncated: expected {declared} images, found {found}")
             # before they are read, as a damaged header may promise more than any memory holds
-            if series.dtype is None or series.dtype.newbyteorder("=") != np.uint16:  # ImageJ writes big-endian
-                raise ExperimentError(f"{path}: expected uint16 counts, found {series.dtype}")
+            _check_counts(path, series.dtype)
             shape = (1,) * (3 - len(series.shape)) + tuple(series.shape)
             if len(shape) != 3 or shape[1:] != size or not shape[0]:
                 raise ExperimentError(
@@ -58,6 +62,49 @@ def read_stack(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
         raise _unreadable(path, error) from None
     except Exception as error:  # a damaged header makes tifffile and what it calls raise errors of every kind
         raise _unreadable(path, error) from None
+
+
+def read_radiograph(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
+    """Return the counts (row, column) of a TIFF of one image, of a size (rows, columns) in px, into memory.
+
+    The file may still be written to. Raises UnfinishedError, in one line, unless all that it says is there, and
+    ExperimentError for one that is whole, but of several images, of other counts or of another size.
+    """
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            if not len(tiff.pages):
+                raise UnfinishedError(f"{path}: expected one image, found none")
+            page = tiff.pages.first
+            # first, as what is not written yet may pass for another size
+            _check_whole(path, page, tiff.filehandle.size)
+            _check_counts(path, page.dtype)
+            found = tuple(page.shape) if len(tiff.pages) == 1 else (len(tiff.pages), *page.shape)
+            if found != size:
+                raise ExperimentError(f"{path}: expected one image {size} as in {DESCRIPTION}, found {found}")
+            return page.asarray()
+    except ExperimentError:
+        raise
+    except FileNotFoundError:
+        raise UnfinishedError(f"{path}: expected a TIFF, found none") from None
+    except Exception as error:  # half a header makes tifffile and what it calls raise errors of every kind
+        raise UnfinishedError(f"{path}: expected a TIFF, cannot read it: {' '.join(str(error).split())}") from None
+
+
+def _check_whole(path: Path, page: tifffile.TiffPage, length: int) -> None:
+    """Raise UnfinishedError unless a file of so many bytes holds all parts of an image, none of them still empty."""
+    parts = list(zip(page.dataoffsets, page.databytecounts, strict=True))
+    needed = max((offset + count for offset, count in parts), default=0)
+    if length < needed:
+        raise UnfinishedError(f"{path}: expected {needed} bytes, found {length}")
+    # some programs note where a part lies only once it is written; of a part noted as nowhere, tifffile makes zeros
+    written, due = sum(1 for offset, count in parts if offset and count), math.prod(page.chunked)
+    if written != due:
+        raise UnfinishedError(f"{path}: expected all {due} parts of an image, found {written}")
+
+
+def _check_counts(path: Path, found: np.dtype[Any] | None) -> None:
+    if found is None or found.newbyteorder("=") != np.uint16:  # ImageJ writes big-endian
+        raise ExperimentError(f"{path}: expected uint16 counts, found {found}")
 
 
 def _unreadable(path: Path, error: Exception) -> ExperimentError:

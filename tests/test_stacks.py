@@ -1,12 +1,18 @@
-"""Stacks in TIFF files: of few images, cut short, damaged, and begun by a writer that was killed."""
+"""TIFF files: stacks of few images, cut short, damaged, begun by a writer that was killed; half a radiograph."""
 
 from __future__ import annotations
+
+from contextlib import nullcontext, suppress
 
 import numpy as np
 import pytest
 import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pdvc.stacks import ExperimentError, StackWriter, read_stack
+from pdvc.stacks import ExperimentError, StackWriter, UnfinishedError, read_radiograph, read_stack
+from tests.laws import law
+from tests.radiograph_files import LAYOUTS, by_tifffile, header_last, random_counts
 
 ROWS, COLUMNS = 6, 7
 
@@ -74,3 +80,104 @@ def test_a_whole_stack_that_was_damaged_since_is_begun_anew(tmp_path, left):
         for i, image in enumerate(images):
             writer.write(i, image)
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), images)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_radiograph_of_any_layout_is_read_into_memory(tmp_path, layout):
+    counts = random_counts(1, (5, 4))
+    (tmp_path / "a.tif").write_bytes(LAYOUTS[layout](counts))
+    found = read_radiograph(tmp_path / "a.tif", (5, 4))
+    (tmp_path / "a.tif").write_bytes(b"")
+    np.testing.assert_array_equal(found, counts)
+    assert found.dtype == np.uint16  # of this machine's byte order
+
+
+def check_prefix(path, content, length, counts):
+    """Check that the first bytes of a radiograph are told to be unfinished, unless all its counts are there."""
+    path.write_bytes(content[:length])
+    # the last four bytes may be the note that no further image follows, which is not needed
+    if length < len(content) - 4:
+        with pytest.raises(UnfinishedError, match=r"\.tif: expected ") as caught:
+            read_radiograph(path, counts.shape)
+        assert "\n" not in str(caught.value)
+        return
+    with nullcontext() if length == len(content) else suppress(UnfinishedError):
+        np.testing.assert_array_equal(read_radiograph(path, counts.shape), counts)
+
+
+def test_a_radiograph_cut_anywhere_is_unfinished_whose_tags_come_last(tmp_path):
+    counts = random_counts(2, (3, 2))
+    content = header_last(counts)
+    for length in range(len(content) + 1):
+        check_prefix(tmp_path / "a.tif", content, length, counts)
+
+
+@law(150)
+@given(st.sampled_from(sorted(LAYOUTS)), st.data())
+def test_a_radiograph_cut_anywhere_is_unfinished(tmp_path_factory, layout, data):
+    counts = random_counts(3, (5, 4))
+    content = LAYOUTS[layout](counts)
+    length = data.draw(st.integers(0, len(content)))
+    check_prefix(tmp_path_factory.getbasetemp() / "cut.tif", content, length, counts)
+
+
+def test_a_part_that_is_noted_as_empty_is_not_written_yet(tmp_path):
+    """Libtiff notes where a strip lies when it is written; tifffile makes zeros of those that are nowhere."""
+    path = tmp_path / "a.tif"
+    path.write_bytes(LAYOUTS["strips"](random_counts(4, (5, 4))))
+    for tag in ("StripOffsets", "StripByteCounts"):
+        whole = path.read_bytes()
+        with tifffile.TiffFile(path, mode="r+b") as tiff:
+            values = tiff.pages.first.tags[tag].value
+            tiff.pages.first.tags[tag].overwrite([*values[:-1], 0])
+        with pytest.raises(UnfinishedError, match="expected all 3 parts of an image, found 2"):
+            read_radiograph(path, (5, 4))
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (by_tifffile(random_counts(5, (4, 5))), r"one image \(5, 4\) as in experiment.toml, found \(4, 5\)$"),
+        (by_tifffile(random_counts(5, (2, 5, 4))), r"one image \(5, 4\) as in experiment.toml, found \(2, 5, 4\)$"),
+        (by_tifffile(random_counts(5, (5, 4)).astype(np.uint8)), "uint16 counts, found uint8$"),
+        (by_tifffile(random_counts(5, (5, 4)).astype(np.int16)), "uint16 counts, found int16$"),
+        (by_tifffile(random_counts(5, (5, 4)).astype(np.float32)), "uint16 counts, found float32$"),
+    ],
+)
+def test_a_radiograph_of_another_size_or_type_is_refused_for_good(tmp_path, content, said):
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(ExperimentError, match=rf"a\.tif: expected {said}") as caught:
+        read_radiograph(tmp_path / "a.tif", (5, 4))
+    assert not isinstance(caught.value, UnfinishedError)
+
+
+def test_a_radiograph_of_another_type_is_unfinished_first(tmp_path):
+    """As long as it is not whole it may be anything."""
+    content = by_tifffile(random_counts(6, (5, 4)).astype(np.int32))
+    (tmp_path / "a.tif").write_bytes(content[:-1])
+    with pytest.raises(UnfinishedError, match=f"expected {len(content)} bytes, found {len(content) - 1}"):
+        read_radiograph(tmp_path / "a.tif", (5, 4))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "a TIFF, cannot read it: not a TIFF"),
+        (b"II*\0\0\0\0\0", "one image, found none$"),
+        (b"not a TIFF at all", "a TIFF, cannot read it: not a TIFF"),
+        (b"\0" * 400, "a TIFF, cannot read it: not a TIFF"),
+    ],
+)
+def test_what_is_no_tiff_may_become_one(tmp_path, content, said):
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(UnfinishedError, match=rf"a\.tif: expected {said}"):
+        read_radiograph(tmp_path / "a.tif", (5, 4))
+
+
+def test_a_radiograph_that_is_not_there_or_a_folder_is_unfinished(tmp_path):
+    with pytest.raises(UnfinishedError, match=r"a\.tif: expected a TIFF, found none$"):
+        read_radiograph(tmp_path / "a.tif", (5, 4))
+    (tmp_path / "a.tif").mkdir()
+    with pytest.raises(UnfinishedError, match=r"a\.tif: expected a TIFF, cannot read it: "):
+        read_radiograph(tmp_path / "a.tif", (5, 4))
