@@ -2,7 +2,7 @@
 
 After the reference scan, `make_ready` prepares all that does not depend on the test and keeps it. `follow` then takes
 each radiograph as soon as it is whole (`pdvc.incoming`), finds the motion (`pdvc.tracker`), and adds it to the record
-(`pdvc.record`); when all planned radiographs are in, the whole test is measured as `pdvc.protocol` does.
+(`pdvc.record`); when all that are planned are in, the whole test is measured as in `pdvc.protocol`.
 
 What the tracker knows is written beside the work before a line is added to the record, line included: a process that is
 killed and started again goes on with the radiograph that it had in hand, to the same numbers.
@@ -31,6 +31,7 @@ from pdvc.lock import held
 from pdvc.measurement import Measurement
 from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.progress import Progress, silent
+from pdvc.radiograph_table import TABLE
 from pdvc.record import LostLine, MeasurementLine, Record, StepLine, TestLine, read_record
 from pdvc.resumable import measure_into
 from pdvc.setup import Setup, set_up
@@ -66,12 +67,13 @@ def follow(
     work: Path | None = None,
     progress: Progress = silent,
     tell: Callable[[StepLine | LostLine], None] = lambda _: None,
-    over: Callable[[], bool] = lambda: False,
+    idle_s: float = float("inf"),
 ) -> Measurement:
-    """Follow the radiographs that come into a folder, until all that are planned are in or `over` says so.
+    """Follow the radiographs that come into a folder, until all that are planned are in, or none for `idle_s`.
 
     Adds to `record_of(file)`, then measures the whole test into `file`, and returns the measurement. `tell` is called
-    with each line that is added. `work` as in `measure_into`, with what `make_ready` has kept there.
+    with each line that is added. `work` as in `measure_into`, with what `make_ready` has kept there. Interrupted, it
+    goes on where it was.
     Raises ExperimentError where the folder cannot be followed, ValueError where the test cannot be measured or the
     record belongs to another one, InUseError where another process is at the same file.
     """
@@ -81,8 +83,11 @@ def follow(
         setup = set_up(experiment, options, work=folder, progress=progress)
         follower = _Follower(setup, Tracker(setup, progress), radiographs, record_of(file), folder / "live")
         try:
-            while follower.missing and not over():
-                if not follower.look(tell) and not follower.settle():
+            heard = time.monotonic()
+            while follower.missing and time.monotonic() < heard + idle_s:
+                if follower.look(tell):
+                    heard = time.monotonic()
+                elif not follower.settle():
                     time.sleep(POLL_S)
             started = time.perf_counter()
             measurement = measure_into(file, follower.recorded(), options, work=folder, progress=progress)
@@ -119,10 +124,10 @@ class _Follower:
             shutil.rmtree(folder, ignore_errors=True)
             self.record.add(first)
         lines = list(read_record(record))
-        taken = {line.step for line in lines if isinstance(line, StepLine)}
+        self._done = {line.step for line in lines if isinstance(line, StepLine)}
         self._lost = {line for line in lines if isinstance(line, LostLine)}
-        self._done = taken | {line.step for line in self._lost}
-        self._incoming = self._opened(taken)
+        # what was lost is looked at again, and said once
+        self._incoming = self._opened(self._done)
 
     @property
     def missing(self) -> bool:
@@ -133,7 +138,10 @@ class _Follower:
         """Take in what has come; return whether anything has."""
         arrived, given_up = self._incoming.look()
         for unreadable in given_up:
-            self._lose(LostLine(step=unreadable.step, file=unreadable.file, reason=unreadable.reason), tell)
+            self._say_lost(LostLine(step=unreadable.step, file=unreadable.file, reason=unreadable.reason), tell)
+            # a right line may follow a wrong one of the table
+            if unreadable.file != TABLE:
+                self._done.add(unreadable.step)
         for arrival in arrived:
             self._take(arrival, tell)
         return bool(arrived or given_up)
@@ -169,7 +177,8 @@ class _Follower:
             taken = self._tracker.take(arrival)
         except Late as error:
             reason = f"{error}; it takes part in the measurement of the whole test"
-            self._lose(LostLine(step=arrival.step, file=arrival.file, reason=reason), tell)
+            self._say_lost(LostLine(step=arrival.step, file=arrival.file, reason=reason), tell)
+            self._done.add(arrival.step)
             return
         line = _line(self._setup, arrival, taken, time.perf_counter() - started)
         self._keep(arrival.step, taken.told, line)
@@ -177,13 +186,12 @@ class _Follower:
         self._done.add(arrival.step)
         tell(line)
 
-    def _lose(self, line: LostLine, tell: Callable[[StepLine | LostLine], None]) -> None:
+    def _say_lost(self, line: LostLine, tell: Callable[[StepLine | LostLine], None]) -> None:
         """Say that a radiograph cannot be used; once, however often the test is gone on with."""
         if line not in self._lost:
             self.record.add(line)
             self._lost.add(line)
             tell(line)
-        self._done.add(line.step)
 
     def _keep(self, step: int, told: Told, line: StepLine) -> None:
         """Keep what is needed to go on after this step, whole or not at all."""

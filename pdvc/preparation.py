@@ -36,7 +36,7 @@ from pdvc.reconstruction import fdk, one_of
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, set_up
 from pdvc.store import Keep
-from pdvc.systematic import Systematic
+from pdvc.systematic import Systematic, nothing_ready
 from pdvc.volume import Hull, Volume
 from pdvc.window import reached_rows, scan_grid
 
@@ -88,15 +88,35 @@ class AtRest:
     """What the volume's re-projection leaves; it knows of no step yet."""
 
 
-def at_rest(setup: Setup, scale: int, progress: Progress = silent) -> AtRest:
-    """Return what one scale takes from the reference scan."""
+def at_rest(setup: Setup, scale: int, progress: Progress = silent, *, all_views: bool = False) -> AtRest:
+    """Return what one scale takes from the reference scan; e of all views at once, or as steps look along them."""
     experiment, options = setup.experiment, setup.options
     geometry = experiment.geometry.binned(scale)
     part = tuple(edge // scale for edge in setup.window)
     view = _viewer(experiment.reference, setup.calibration, scale, options.smooth_px)
     volume = reference_volume(setup, scale, progress)
     systematic = _systematic(experiment.reference, geometry, part, view, volume, setup.sections.radius_mm, scale)
+    if all_views:
+        systematic = _of_all_views(setup, scale, systematic, progress)
     return AtRest(scale=scale, volume=volume, geometry=geometry, part=part, view=view, systematic=systematic)
+
+
+def _of_all_views(setup: Setup, scale: int, systematic: Systematic, progress: Progress) -> Systematic:
+    """Return the same with e of all views at hand; every experiment with the same reference scan finds it kept."""
+
+    def made() -> dict[str, NDArray[np.float16]]:
+        left = np.empty((len(systematic.view_rad), *systematic.detector), dtype=np.float16)
+        for start in range(0, len(left), _VIEWS_AT_HAND):
+            some = range(start, min(start + _VIEWS_AT_HAND, len(left)))
+            systematic.ready(some)
+            for i in some:
+                left[i] = systematic.left(i)
+            progress(f"views, scale {scale}", some.stop, len(left))
+        return {"e": left}
+
+    depends = (setup.calibration, setup.outline.hull, scale, _care(setup))
+    kept = setup.store.of_reference("left", depends, made)["e"]
+    return replace(systematic, left=lambda i: kept[i].astype(np.float32), ready=nothing_ready)
 
 
 def prepare(setup: Setup, scale: int, progress: Progress = silent) -> Prepared:
@@ -165,8 +185,7 @@ def _viewer(series: Series, calibration: Calibration, scale: int, smooth_px: flo
 
 def reference_volume(setup: Setup, scale: int, progress: Progress = silent) -> Volume:
     """Reconstruct the reference scan at a scale; every experiment with the same reference scan finds it kept."""
-    calibration, hull = setup.calibration, setup.outline.hull
-    care = Care(smooth_px=setup.options.smooth_px, sharpen=setup.options.sharpen)
+    calibration, hull, care = setup.calibration, setup.outline.hull, _care(setup)
     keep = partial(setup.store.of_reference, "volume", (calibration, hull, scale, care))
     series = setup.experiment.reference
     return scan_volume(series, setup.geometry, calibration, hull, scale, care, keep, progress)
@@ -180,6 +199,10 @@ class Care:
     """Filter of the radiographs, px."""
     sharpen: bool = False
     """Whether radiographs are sharpened by what interpolation blurs, and the phase of what it shifts is corrected."""
+
+
+def _care(setup: Setup) -> Care:
+    return Care(smooth_px=setup.options.smooth_px, sharpen=setup.options.sharpen)
 
 
 def scan_volume(

@@ -5,7 +5,7 @@ whatever happens to the process, and anything may read it meanwhile. The first l
 `what` tells of each line which kind it is::
 
     {"what": "test", "title": ..., "steps": 127, "height_mm": [...], "voxel_mm": 0.0107}
-    {"what": "step", "step": 0, "angle_deg": ..., "time_s": ..., "force_N": ..., "displacement_voxel": [[...], ...], ...}
+    {"what": "step", "step": 0, "angle_deg": ..., "time_s": ..., "displacement_voxel": [[...], ...], ...}
     {"what": "lost", "step": 4, "file": "00004.tif", "reason": "..."}
     {"what": "measurement", "file": "motion.nc", "seconds": 312.0}
 """
@@ -72,6 +72,14 @@ class StepLine(Line):
     unix_s: float
     """When that was, by the clock of the machine, s since 1970."""
 
+    def words(self) -> str:
+        """Return the line for a reader."""
+        strain, deviation = 100 * self.mean_strain, 100 * self.mean_strain_std
+        return (
+            f"step {self.step}: {self.force_N:.0f} N, mean strain {strain:.3f} ± {deviation:.3f} %, "
+            f"chi2 {self.chi2_reduced:.2f}, {self.seconds:.2f} s"
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class LostLine(Line):
@@ -82,6 +90,10 @@ class LostLine(Line):
     """-1 where it is not known."""
     file: str
     reason: str
+
+    def words(self) -> str:
+        """Return the line for a reader."""
+        return f"lost: {self.reason}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +146,9 @@ def read_record(path: Path) -> Iterator[Line]:
             values: dict[str, Any] = json.loads(text)
             yield _KINDS[values.pop("what")](**{key: _tuples(value) for key, value in values.items()})
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"{path}, line {number}: expected a line of a record, got {text[:60]!r}: {error}") from None
+            raise ValueError(
+                f"{path}, line {number}: expected a line of a record, got {text[:60]!r}: {error}"
+            ) from None
 
 
 def _tuples(value: Any) -> Any:

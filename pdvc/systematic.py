@@ -81,7 +81,7 @@ def views_around(view_rad: Floats, direction_rad: Floats, width_rad: float) -> t
     return order[places], share / share.sum(axis=1, keepdims=True)
 
 
-def _nothing(views: Sequence[int]) -> None:
+def nothing_ready(views: Sequence[int]) -> None:
     """Make nothing ready."""
 
 
@@ -92,7 +92,7 @@ class Systematic:
     left: Callable[[int], Image]
     """e (row, column), grey levels, of a reference view, over the whole detector; zero where the volume does not
     reach. Asked for again and again, and only of the views that steps look along."""
-    ready: Callable[[Sequence[int]], None] = _nothing
+    ready: Callable[[Sequence[int]], None] = nothing_ready
     """Told which views will be asked for next, so that they can be made side by side."""
     view_rad: Floats
     """Stage angle of each reference view (view,)."""

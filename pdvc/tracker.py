@@ -77,7 +77,8 @@ class Tracker:
                 f"deformation: expected kind = 'smoother' in the last stage, to follow a test, got {solver.kind!r}"
             )
         self._setup, self._basis = setup, setup.sections
-        self._rest = {scale: at_rest(setup, scale, progress) for scale in setup.options.scales}
+        scales = setup.options.scales
+        self._rest = {scale: at_rest(setup, scale, progress, all_views=True) for scale in scales}
         self._noise, self._detector = stated_noise(setup, self._rest[1].systematic)
         self._blurred = meeting_noise(self._rest[1].volume, self._noise.smooth_px)
         self._pattern = GrowingPattern(self._rest[1].systematic, self._noise)

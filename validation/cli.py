@@ -39,7 +39,7 @@ def _common(
 for _command in (
     *(one.scenarios, one.options, one.simulate, one.inspect, one.measure, one.score, one.report, one.run),
     *(many.compare, many.studies, many.study, many.plan),
-    *(live.play,),
+    *(live.prepare, live.live, live.play),
 ):
     app.command()(_command)
 

@@ -1,4 +1,4 @@
-"""The commands about a test while it runs: play."""
+"""The commands about a test while it runs: prepare, live, play."""
 
 from __future__ import annotations
 
@@ -9,7 +9,84 @@ from typing import Annotated
 
 import typer
 
-from validation.commands.parts import ExperimentFolder, answering, tell
+from validation.commands.parts import (
+    ExperimentFolder,
+    Options,
+    Threads,
+    answering,
+    judge,
+    read_options,
+    tell,
+    use_threads,
+)
+
+
+def prepare(
+    experiment: ExperimentFolder,
+    work: Annotated[Path, typer.Option("--work", metavar="DIR", help="Where what is prepared is kept.")],
+    options: Options = "default",
+    threads: Threads = None,
+) -> None:
+    """Prepare a test that is to be followed while it runs, as soon as its reference scan is done.
+
+    The folder needs no radiographs of the test yet, only what is planned of them in experiment.toml. Interrupted, it
+    goes on where it was when the same command is given again.
+
+    Example:  `pdvc-bench prepare out/quick/experiment --work out/ready`
+    """
+    with answering(resume="give the same command again to go on from here") as progress:
+        from pdvc.experiment import read_experiment
+        from pdvc.live import make_ready
+
+        chosen = read_options(options)
+        use_threads(threads)
+        make_ready(read_experiment(experiment, planned=True), chosen, work=work, progress=progress)
+    tell(f"ready: {work}")
+
+
+def live(
+    experiment: ExperimentFolder,
+    radiographs: Annotated[
+        Path, typer.Option("--radiographs", metavar="FOLDER", help="Where the radiographs of the test arrive.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The measurement to write (NetCDF).")],
+    options: Options = "default",
+    work: Annotated[
+        Path | None,
+        typer.Option("--work", metavar="DIR", help="What prepare has kept. Unless given: beside FILE, made first."),
+    ] = None,
+    idle: Annotated[
+        float | None,
+        typer.Option("--idle", min=0.0, metavar="S", help="The test is over when nothing came for so many seconds."),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the lines of the record on stdout, for another program.")
+    ] = False,
+    threads: Threads = None,
+) -> None:
+    """Follow a test while it runs: the motion of each radiograph, with its interval, as soon as it has come.
+
+    Adds a line to FILE.record.jsonl for each radiograph in FOLDER (see play), and measures the whole test into FILE
+    when all that are planned in experiment.toml are in. Killed, it goes on where it was when the same command is given
+    again.
+
+    Example:  `pdvc-bench live out/quick/experiment --radiographs out/arriving --work out/ready -o out/motion.nc`
+    """
+    with answering(resume="give the same command again to go on from here") as progress:
+        from pdvc.experiment import read_experiment
+        from pdvc.live import follow, record_of
+        from pdvc.record import LostLine, StepLine
+
+        def show(line: StepLine | LostLine) -> None:
+            print(line.text() if as_json else line.words(), flush=True)
+
+        chosen, planned = read_options(options), read_experiment(experiment, planned=True)
+        use_threads(threads)
+        idle_s = float("inf") if idle is None else idle
+        found = follow(planned, radiographs, out, chosen, work=work, progress=progress, tell=show, idle_s=idle_s)
+    tell(f"record: {record_of(out)}")
+    tell(f"measurement: {out}")
+    judge(found)
 
 
 def play(
