@@ -3,7 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -56,6 +56,21 @@ def test_inverse_undoes_a_composition(deformation, turns):
     points = material_points()
     motion = Composition((*deformation, *turns))
     np.testing.assert_allclose(motion.inverse(motion.forward(points, 0), 0), points, atol=1e-9)
+
+
+@FEW
+@given(st.lists(motions(), max_size=3), st.integers(0, 100))
+def test_positions_and_gradient_at_once_are_those_one_by_one(parts, seed):
+    # of three motions in any order sections may cross, where there is no position to compare
+    motion, points = Composition(tuple(parts)), material_points(seed)
+    try:
+        motion.forward(points, 0)
+    except MotionError:
+        assume(False)
+    for each in (motion, *parts[:1]):
+        position, gradient = each.carry(points, 0)
+        np.testing.assert_array_equal(position, each.forward(points, 0))
+        np.testing.assert_array_equal(gradient, each.gradient(points, 0))
 
 
 @FEW
