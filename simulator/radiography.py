@@ -233,6 +233,20 @@ def _column(matrix, k, turn):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reach(c, shape):  # type: ignore[no-untyped-def]
+    """Return how far from the image of its centre c a nodule may be seen, over the detector's distance.
+
+    A s is no longer than |A|, the root of the sum of squares. The image of c + w is (x w - w_x c) / (x (x + w_x)) from
+    that of c, with x = c_x: at most |c| |w| / (x (x - |w|)).
+    """
+    square = 0.0
+    for k in range(3):
+        square += _dot(shape[k], shape[k])
+    size = math.sqrt(square)
+    return math.sqrt(_dot(c, c)) * size / (c[0] * max(c[0] - size, 0.0))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_nodules(total, centres, shapes, turn, column, row, d0, by_column, by_row):  # type: ignore[no-untyped-def]
     """Add each nodule's chord, in depth, at the sub-pixel centres of its silhouette.
 
@@ -243,11 +257,16 @@ def _add_nodules(total, centres, shapes, turn, column, row, d0, by_column, by_ro
     """
     rows, columns = total.shape
     dx, dy = (by_column[0], by_column[1], by_column[2]), (by_row[0], by_row[1], by_row[2])
+    pitch = math.sqrt(_dot(dx, dx))
     chord = np.empty(columns + 3)
     for n in range(len(centres)):
         # columns and rows count from here: they stay small, and the quadratics keep their digits
         jc, ic = round(column[n]), round(row[n])
         c = (centres[n, 0], centres[n, 1], centres[n, 2])
+        # half of the sample is above or below the image
+        reach = 1 + _reach(c, shapes[n]) / pitch
+        if not (-reach < ic < rows + reach and -reach < jc < columns + reach):
+            continue
         a1, a2, a3 = _column(shapes[n], 0, turn), _column(shapes[n], 1, turn), _column(shapes[n], 2, turn)
         # adj(A) by rows: the cross products of the columns of A
         r1, r2, r3 = _cross(a2, a3), _cross(a3, a1), _cross(a1, a2)
