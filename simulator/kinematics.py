@@ -14,18 +14,15 @@ vector r turns by |r| rad about r (Rodrigues). Lengths in mm, arrays of points (
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Protocol
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline, PPoly
+from scipy.interpolate import CubicSpline
 
-from simulator.rounding import fused
+from simulator.each_point import along_beam, on_spline, products, turned, turns
 
 Floats = NDArray[np.float64]
 
@@ -67,8 +64,7 @@ class RigidMotion:
     def forward(self, points_mm: Floats, step: int) -> Floats:
         """Return the positions x of material points X."""
         matrix = rotation_matrix(self.rotation_rad[step])
-        arm = points_mm - self.centre_mm
-        return np.asarray(np.einsum("ab,pb->pa", matrix, arm) + (self.translation_mm[step] + self.centre_mm))
+        return np.asarray(turned(points_mm, matrix, self.centre_mm, self.translation_mm[step] + self.centre_mm))
 
     def inverse(self, points_mm: Floats, step: int) -> Floats:
         """Return the material points X found at positions x."""
@@ -135,7 +131,7 @@ class BeamMotion:
     def carry(self, points_mm: Floats, step: int) -> tuple[Floats, Floats]:
         """Return positions and dx/dX at material points X: columns s R e_x, s R e_y and dx/dZ."""
         section = self._sections(points_mm[:, 2], step)
-        moved, gradient = _along_beam(
+        moved, gradient = along_beam(
             points_mm, section.centre, section.tangent, section.matrix, section.spin, section.stretch, section.growth
         )
         return moved, gradient
@@ -143,11 +139,11 @@ class BeamMotion:
     def _sections(self, height_mm: Floats, step: int) -> _Sections:
         profile = np.column_stack([self.displacement_mm[step], self.rotation_rad[step], self.stretch[step][:, None]])
         spline = CubicSpline(self.knot_mm, profile, bc_type="natural")
-        value, slope = _linear_beyond(spline, self.knot_mm[[0, -1]], height_mm)
+        value, slope = on_spline(self.knot_mm, spline.c, height_mm)
         centre, tangent = value[:, :3].copy(), slope[:, :3].copy()
         centre[:, 2] += height_mm
         tangent[:, 2] += 1.0
-        matrix, spin = _turns(value[:, 3:6], slope[:, 3:6])
+        matrix, spin = turns(value[:, 3:6], slope[:, 3:6])
         return _Sections(
             shift=value[:, :3],
             centre=centre,
@@ -267,14 +263,14 @@ class Composition:
         result: Floats = np.broadcast_to(np.eye(3), (len(points_mm), 3, 3))
         for motion in self.motions:
             points_mm, gradient = motion.carry(points_mm, step)
-            result = gradient @ result
+            result = products(gradient, result)
         return points_mm, result
 
 
 def rotation_matrix(vector_rad: ArrayLike) -> Floats:
     """Return exp([r]x), the rotation by |r| rad about r: (..., 3) to (..., 3, 3)."""
     vector = np.asarray(vector_rad, dtype=np.float64)
-    matrix, _ = _turns(vector.reshape(-1, 3), np.zeros((vector.size // 3, 3)))
+    matrix, _ = turns(vector.reshape(-1, 3), np.zeros((vector.size // 3, 3)))
     return np.asarray(matrix.reshape(*vector.shape, 3))
 
 
@@ -284,63 +280,3 @@ def cross_matrix(vector: ArrayLike) -> Floats:
     zero = np.zeros_like(x)
     rows = [np.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     return np.stack(rows, axis=-2)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _along_beam(points, centre, tangent, matrix, spin, stretch, growth):  # type: ignore[no-untyped-def]
-    """Return x = c + R s [X, Y, 0] (point, 3) and dx/dX (point, 3, 3), from the section of each point."""
-    moved, gradient = np.empty(points.shape), np.empty(matrix.shape)
-    for p in range(len(points)):
-        x, y = points[p, 0], points[p, 1]
-        s, g, q = stretch[p], growth[p], spin[p]
-        arm = (
-            matrix[p, 0, 0] * (x * s) + matrix[p, 0, 1] * (y * s),
-            matrix[p, 1, 0] * (x * s) + matrix[p, 1, 1] * (y * s),
-            matrix[p, 2, 0] * (x * s) + matrix[p, 2, 1] * (y * s),
-        )
-        turned = q[1] * arm[2] - q[2] * arm[1], q[2] * arm[0] - q[0] * arm[2], q[0] * arm[1] - q[1] * arm[0]
-        for a in range(3):
-            moved[p, a] = centre[p, a] + arm[a]
-            gradient[p, a, 0] = matrix[p, a, 0] * s
-            gradient[p, a, 1] = matrix[p, a, 1] * s
-            # along Z the section moves on and turns, and its points move out
-            out = matrix[p, a, 0] * (g * x) + matrix[p, a, 1] * (g * y)
-            gradient[p, a, 2] = tangent[p, a] + turned[a] + out
-    return moved, gradient
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _turns(vector, slope):  # type: ignore[no-untyped-def]
-    """Return R = exp([r]x) (point, 3, 3), and q of dR/dZ = [q]x R for dr/dZ = slope (point, 3).
-
-    With the angle a = |r|, C = [r]x and C^2 = r r^T - a^2: R = 1 + f C + g C^2 and q = (1 + g C + h C^2) dr/dZ, where
-    f = sin a / a, g = (1 - cos a) / a^2 and h = (a - sin a) / a^3.
-    """
-    matrix, spin = np.empty((len(vector), 3, 3)), np.empty((len(vector), 3))
-    for p in range(len(vector)):
-        x, y, z = vector[p, 0], vector[p, 1], vector[p, 2]
-        a = math.sqrt(x * x + y * y + z * z)
-        # the closed forms lose digits at small angles, where three terms of the series are exact to 1e-15
-        if a < 0.02:
-            square = a * a
-            f = 1 - square / 6 + square * square / 120 - square * square * square / 5040
-            g, h = 0.5 - square / 24 + square * square / 720, 1 / 6 - square / 120 + square * square / 5040
-        else:
-            f, g, h = math.sin(a) / a, (1 - math.cos(a)) / (a * a), (a - math.sin(a)) / a**3.0
-        xx, yy, zz = -fused(y, y, z * z), -fused(x, x, z * z), -fused(x, x, y * y)
-        xy, xz, yz = x * y, x * z, y * z
-        matrix[p, 0] = 1 + g * xx, g * xy - f * z, g * xz + f * y
-        matrix[p, 1] = g * xy + f * z, 1 + g * yy, g * yz - f * x
-        matrix[p, 2] = g * xz - f * y, g * yz + f * x, 1 + g * zz
-        u, v, w = slope[p, 0], slope[p, 1], slope[p, 2]
-        spin[p, 0] = (1 + h * xx) * u + (h * xz + g * y) * w + (h * xy - g * z) * v
-        spin[p, 1] = (h * xy + g * z) * u + (h * yz - g * x) * w + (1 + h * yy) * v
-        spin[p, 2] = (h * xz - g * y) * u + (1 + h * zz) * w + (h * yz + g * x) * v
-    return matrix, spin
-
-
-def _linear_beyond(curve: PPoly | Callable[..., Floats], ends: Floats, height: Floats) -> tuple[Floats, Floats]:
-    """Return value and slope of a curve, continued by its tangent beyond its two ends."""
-    clipped = np.clip(height, ends[0], ends[1])
-    slope = curve(clipped, 1)
-    return curve(clipped) + slope * (height - clipped)[:, None], slope

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from simulator.each_point import products
 from simulator.kinematics import Motion, rotation_matrix
 from simulator.microstructure import place
 from simulator.radiography import Body
@@ -34,7 +35,7 @@ def moved_body(body: Body, motion: Motion, step: int) -> Body:
         vertices_mm=motion.forward(body.vertices_mm, step),
         faces=body.faces,
         centres_mm=centres,
-        shapes_mm=gradient @ body.shapes_mm,
+        shapes_mm=products(gradient, body.shapes_mm),
     )
 
 
