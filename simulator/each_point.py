@@ -103,7 +103,8 @@ def on_spline(knots, coefficients, height):  # type: ignore[no-untyped-def]
         below = min(np.searchsorted(knots, inside, side="right"), len(knots) - 1) - 1
         s, beyond = inside - knots[below], height[p] - inside
         for n in range(value.shape[1]):
-            c3, c2, c1, c0 = coefficients[:, below, n]
+            c3, c2 = coefficients[0, below, n], coefficients[1, below, n]
+            c1, c0 = coefficients[2, below, n], coefficients[3, below, n]
             slope[p, n] = c1 + c2 * s * 2 + c3 * (s * s) * 3
             value[p, n] = c0 + c1 * s + c2 * (s * s) + c3 * (s * s * s) + slope[p, n] * beyond
     return value, slope
