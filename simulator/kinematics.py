@@ -14,14 +14,15 @@ vector r turns by |r| rad about r (Rodrigues). Lengths in mm, arrays of points (
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline, PPoly
+from scipy.interpolate import CubicSpline
+
+from simulator.each_point import along_beam, on_spline, products, turned, turns
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +41,9 @@ class Motion(Protocol):
 
     def gradient(self, points_mm: Floats, step: int) -> Floats:
         """Return the deformation gradient dx/dX at material points X, (point, 3, 3)."""
+
+    def carry(self, points_mm: Floats, step: int) -> tuple[Floats, Floats]:
+        """Return the positions and the deformation gradient at once, for less than they cost one by one."""
 
 
 class MotionError(ValueError):
@@ -60,8 +64,7 @@ class RigidMotion:
     def forward(self, points_mm: Floats, step: int) -> Floats:
         """Return the positions x of material points X."""
         matrix = rotation_matrix(self.rotation_rad[step])
-        arm = points_mm - self.centre_mm
-        return np.asarray(np.einsum("ab,pb->pa", matrix, arm) + (self.translation_mm[step] + self.centre_mm))
+        return np.asarray(turned(points_mm, matrix, self.centre_mm, self.translation_mm[step] + self.centre_mm))
 
     def inverse(self, points_mm: Floats, step: int) -> Floats:
         """Return the material points X found at positions x."""
@@ -72,6 +75,10 @@ class RigidMotion:
     def gradient(self, points_mm: Floats, step: int) -> Floats:
         """Return R for every point."""
         return np.broadcast_to(rotation_matrix(self.rotation_rad[step]), (len(points_mm), 3, 3))
+
+    def carry(self, points_mm: Floats, step: int) -> tuple[Floats, Floats]:
+        """Return positions and R for every point."""
+        return self.forward(points_mm, step), self.gradient(points_mm, step)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +100,7 @@ class BeamMotion:
 
     def forward(self, points_mm: Floats, step: int) -> Floats:
         """Return the positions x of material points X."""
-        section = self._sections(points_mm[:, 2], step)
-        return np.asarray(section.centre + np.einsum("pab,pb->pa", section.matrix, section.flat(points_mm)))
+        return self.carry(points_mm, step)[0]
 
     def inverse(self, points_mm: Floats, step: int) -> Floats:
         """Return the material points X found at positions x.
@@ -119,28 +125,31 @@ class BeamMotion:
         raise MotionError(f"beam motion at step {step}: the sections cross, no unique material point")
 
     def gradient(self, points_mm: Floats, step: int) -> Floats:
-        """Return dx/dX at material points X: columns s R e_x, s R e_y and dx/dZ."""
+        """Return dx/dX at material points X."""
+        return self.carry(points_mm, step)[1]
+
+    def carry(self, points_mm: Floats, step: int) -> tuple[Floats, Floats]:
+        """Return positions and dx/dX at material points X: columns s R e_x, s R e_y and dx/dZ."""
         section = self._sections(points_mm[:, 2], step)
-        arm = np.einsum("pab,pb->pa", section.matrix, section.flat(points_mm))
-        growth = section.growth[:, None] * np.column_stack([points_mm[:, :2], np.zeros(len(points_mm))])
-        along = section.tangent + np.cross(section.spin, arm)
-        along += np.einsum("pab,pb->pa", section.matrix, growth)
-        result = section.matrix * section.stretch[:, None, None]
-        result[:, :, 2] = along
-        return result
+        moved, gradient = along_beam(
+            points_mm, section.centre, section.tangent, section.matrix, section.spin, section.stretch, section.growth
+        )
+        return moved, gradient
 
     def _sections(self, height_mm: Floats, step: int) -> _Sections:
         profile = np.column_stack([self.displacement_mm[step], self.rotation_rad[step], self.stretch[step][:, None]])
         spline = CubicSpline(self.knot_mm, profile, bc_type="natural")
-        value, slope = _linear_beyond(spline, self.knot_mm[[0, -1]], height_mm)
-        axis = np.zeros((len(height_mm), 3))
-        axis[:, 2] = 1.0
+        value, slope = on_spline(self.knot_mm, spline.c, height_mm)
+        centre, tangent = value[:, :3].copy(), slope[:, :3].copy()
+        centre[:, 2] += height_mm
+        tangent[:, 2] += 1.0
+        matrix, spin = turns(value[:, 3:6], slope[:, 3:6])
         return _Sections(
             shift=value[:, :3],
-            centre=value[:, :3] + axis * height_mm[:, None],
-            tangent=slope[:, :3] + axis,
-            matrix=rotation_matrix(value[:, 3:6]),
-            spin=_spin(value[:, 3:6], slope[:, 3:6]),
+            centre=centre,
+            tangent=tangent,
+            matrix=matrix,
+            spin=spin,
             stretch=value[:, 6],
             growth=slope[:, 6],
         )
@@ -157,10 +166,6 @@ class _Sections:
     spin: Floats
     stretch: Floats
     growth: Floats
-
-    def flat(self, points_mm: Floats) -> Floats:
-        """Return s [X, Y, 0]."""
-        return np.column_stack([points_mm[:, :2] * self.stretch[:, None], np.zeros(len(points_mm))])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,8 +202,12 @@ class SectionMotion:
 
     def gradient(self, points_mm: Floats, step: int) -> Floats:
         """Return dx/dX = (I - du/dx)^-1 at material points X."""
-        inverse = np.linalg.inv(self._inverse_gradient(self.forward(points_mm, step), step))
-        return np.asarray(inverse, dtype=np.float64)
+        return self.carry(points_mm, step)[1]
+
+    def carry(self, points_mm: Floats, step: int) -> tuple[Floats, Floats]:
+        """Return positions and dx/dX at material points X."""
+        x = self.forward(points_mm, step)
+        return x, np.asarray(np.linalg.inv(self._inverse_gradient(x, step)), dtype=np.float64)
 
     def displacement(self, points_mm: Floats, step: int) -> Floats:
         """Return u (point, 3), mm, at current positions x."""
@@ -247,19 +256,22 @@ class Composition:
 
     def gradient(self, points_mm: Floats, step: int) -> Floats:
         """Return dx/dX by the chain rule."""
+        return self.carry(points_mm, step)[1]
+
+    def carry(self, points_mm: Floats, step: int) -> tuple[Floats, Floats]:
+        """Return positions, and dx/dX by the chain rule."""
         result: Floats = np.broadcast_to(np.eye(3), (len(points_mm), 3, 3))
         for motion in self.motions:
-            result = motion.gradient(points_mm, step) @ result
-            if motion is not self.motions[-1]:
-                points_mm = motion.forward(points_mm, step)
-        return result
+            points_mm, gradient = motion.carry(points_mm, step)
+            result = products(gradient, result)
+        return points_mm, result
 
 
 def rotation_matrix(vector_rad: ArrayLike) -> Floats:
     """Return exp([r]x), the rotation by |r| rad about r: (..., 3) to (..., 3, 3)."""
-    first, second, _ = _exponential_factors(vector_rad)
-    cross = cross_matrix(vector_rad)
-    return np.eye(3) + first * cross + second * (cross @ cross)
+    vector = np.asarray(vector_rad, dtype=np.float64)
+    matrix, _ = turns(vector.reshape(-1, 3), np.zeros((vector.size // 3, 3)))
+    return np.asarray(matrix.reshape(*vector.shape, 3))
 
 
 def cross_matrix(vector: ArrayLike) -> Floats:
@@ -268,31 +280,3 @@ def cross_matrix(vector: ArrayLike) -> Floats:
     zero = np.zeros_like(x)
     rows = [np.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     return np.stack(rows, axis=-2)
-
-
-def _spin(vector: Floats, slope: Floats) -> Floats:
-    """Return the axial vector q of dR/dZ = [q]x R, for R = exp([r]x) and dr/dZ = slope."""
-    _, second, third = _exponential_factors(vector)
-    cross = cross_matrix(vector)
-    jacobian = np.eye(3) + second * cross + third * (cross @ cross)
-    return np.asarray(np.einsum("...ab,...b->...a", jacobian, slope))
-
-
-def _exponential_factors(vector: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Return sin a / a, (1 - cos a) / a^2 and (a - sin a) / a^3 of the angle a = |r|, (..., 1, 1)."""
-    angle = np.linalg.norm(np.asarray(vector, dtype=float), axis=-1)[..., None, None]
-    small = angle < 0.02
-    a = np.where(small, 1.0, angle)
-    square = angle**2
-    # the closed forms lose digits at small angles, where three terms of the series are exact to 1e-15
-    first = np.where(small, 1 - square / 6 + square**2 / 120 - square**3 / 5040, np.sin(a) / a)
-    second = np.where(small, 0.5 - square / 24 + square**2 / 720, (1 - np.cos(a)) / a**2)
-    third = np.where(small, 1 / 6 - square / 120 + square**2 / 5040, (a - np.sin(a)) / a**3)
-    return first, second, third
-
-
-def _linear_beyond(curve: PPoly | Callable[..., Floats], ends: Floats, height: Floats) -> tuple[Floats, Floats]:
-    """Return value and slope of a curve, continued by its tangent beyond its two ends."""
-    clipped = np.clip(height, ends[0], ends[1])
-    slope = curve(clipped, 1)
-    return curve(clipped) + slope * (height - clipped)[:, None], slope

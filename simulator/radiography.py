@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.geometry import ConeBeam
+from simulator.rounding import fused
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,10 +73,10 @@ def path_lengths(
     if subpixels < 1:
         raise ValueError(f"subpixels: expected at least 1, got {subpixels}")
     fine = _Screen.of(geometry, subpixels)
-    vertices = _to_lab(body.vertices_mm, angle_rad)
-    centres = _to_lab(body.centres_mm, angle_rad)
+    turn = math.cos(angle_rad), math.sin(angle_rad)
+    vertices = _from_source(body.vertices_mm, turn, geometry.source_axis_mm)
+    centres = _from_source(body.centres_mm, turn, geometry.source_axis_mm)
     for points in (vertices, centres):
-        points[:, 0] += geometry.source_axis_mm
         _check_depth(points[:, 0], geometry, angle_rad)
     # depths of some 30 mm that cancel to a length of 1 mm: in double precision
     surface = np.zeros((fine.rows, fine.columns))
@@ -83,8 +84,7 @@ def path_lengths(
         surface, *fine.image_of(vertices), 1 / vertices[:, 0], np.ascontiguousarray(body.faces, dtype=np.int64)
     )
     graphite = np.zeros((fine.rows, fine.columns), dtype=np.float32)
-    shapes = _to_lab(body.shapes_mm.swapaxes(1, 2), angle_rad)
-    _add_nodules(graphite, centres, shapes, *fine.image_of(centres), *fine.rays())
+    _add_nodules(graphite, centres, body.shapes_mm, turn, *fine.image_of(centres), *fine.rays())
     return _lengths(surface, graphite, *fine.rays()), graphite
 
 
@@ -121,12 +121,8 @@ class _Screen:
 
     def image_of(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project points (n, 3), x counted from the source: fractional column and row numbers (n,)."""
-        depth = points[:, 0]
-        u = -points[:, 1] * self.distance / depth - self.shift[0]
-        v = -points[:, 2] * self.distance / depth - self.shift[1]
-        c, s = self.roll
-        column = (c * u + s * v) / self.pitch + (self.columns - 1) / 2
-        row = (c * v - s * u) / self.pitch + (self.rows - 1) / 2
+        middle = (self.columns - 1) / 2, (self.rows - 1) / 2
+        column, row = _image_of(points, self.distance, self.shift, self.roll, self.pitch, middle)
         return column, row
 
     def rays(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -139,13 +135,31 @@ class _Screen:
         return centre - by_column * (self.columns - 1) / 2 - by_row * (self.rows - 1) / 2, by_column, by_row
 
 
-def _to_lab(vectors: NDArray[np.float64], angle_rad: float) -> NDArray[np.float64]:
-    """Turn vectors (..., 3) by +angle about z."""
-    c, s = math.cos(angle_rad), math.sin(angle_rad)
-    return np.ascontiguousarray(vectors @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _from_source(points, turn, source_axis):  # type: ignore[no-untyped-def]
+    """Turn points (n, 3) by +angle about z, given its cosine and sine, and count x from the source."""
+    c, s = turn
+    lab = np.empty(points.shape)
+    for n in range(len(points)):
+        x, y = points[n, 0], points[n, 1]
+        lab[n] = fused(-s, y, c * x) + source_axis, fused(c, y, s * x), points[n, 2]
+    return lab
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _image_of(points, distance, shift, roll, pitch, middle):  # type: ignore[no-untyped-def]
+    """Return fractional column and row numbers (n,) of points, see `_Screen.image_of`."""
+    c, s = roll
+    column, row = np.empty(len(points)), np.empty(len(points))
+    for n in range(len(points)):
+        depth = points[n, 0]
+        u, v = -points[n, 1] * distance / depth - shift[0], -points[n, 2] * distance / depth - shift[1]
+        column[n] = (c * u + s * v) / pitch + middle[0]
+        row[n] = (c * v - s * u) / pitch + middle[1]
+    return column, row
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_surface(total, column, row, nearness, faces):  # type: ignore[no-untyped-def]
     """Add the signed crossing depths of each triangle at the sub-pixel centres it covers.
 
@@ -188,9 +202,10 @@ def _add_surface(total, column, row, nearness, faces):  # type: ignore[no-untype
             sign = 1.0 if at[0] > at[1] else -1.0
             start, stop = max(math.ceil(min(at[0], at[1])), 0), min(math.ceil(max(at[0], at[1])), columns)
             base = w + gr * (i - r0) - gc * c0
+            line = total[i, start : max(start, stop)]
             # limited, as a triangle seen edge on has hardly an area to divide by
-            for j in range(start, stop):
-                total[i, j] += sign / min(max(base + gc * j, low), high)
+            for k in range(len(line)):
+                line[k] += sign / min(max(base + gc * (start + k), low), high)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -210,23 +225,49 @@ def _times(a, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_nodules(total, centres, shapes, column, row, d0, by_column, by_row):  # type: ignore[no-untyped-def]
+def _column(matrix, k, turn):  # type: ignore[no-untyped-def]
+    """Return column k of a matrix (3, 3), turned about z by the angle whose cosine and sine are given."""
+    c, s = turn
+    x, y = matrix[0, k], matrix[1, k]
+    return x * c - y * s, x * s + y * c, matrix[2, k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _reach(c, shape):  # type: ignore[no-untyped-def]
+    """Return how far from the image of its centre c a nodule may be seen, over the detector's distance.
+
+    A s is no longer than |A|, the root of the sum of squares. The image of c + w is (x w - w_x c) / (x (x + w_x)) from
+    that of c, with x = c_x: at most |c| |w| / (x (x - |w|)).
+    """
+    square = 0.0
+    for k in range(3):
+        square += _dot(shape[k], shape[k])
+    size = math.sqrt(square)
+    return math.sqrt(_dot(c, c)) * size / (c[0] * max(c[0] - size, 0.0))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_nodules(total, centres, shapes, turn, column, row, d0, by_column, by_row):  # type: ignore[no-untyped-def]
     """Add each nodule's chord, in depth, at the sub-pixel centres of its silhouette.
 
-    `centres` count x from the source; `shapes` hold the columns of A as rows. Around the sub-pixel that is
-    nearest to the centre's image, with (x, y) columns and rows from there, e = adj(A) d and g = A' f are
-    affine, e = e0 + x ex + y ey, so that |e|^2 - |g|^2 = k0 + kx x + ky y + kxx x^2 + kxy x y + kyy y^2,
-    positive inside an ellipse.
+    `centres` are in the lab and count x from the source; `shapes` are in the sample frame, and turned here. Around the
+    sub-pixel that is nearest to the centre's image, with (x, y) columns and rows from there, e = adj(A) d and g = A' f
+    are affine, e = e0 + x ex + y ey, so that |e|^2 - |g|^2 = k0 + kx x + ky y + kxx x^2 + kxy x y + kyy y^2, positive
+    inside an ellipse.
     """
     rows, columns = total.shape
     dx, dy = (by_column[0], by_column[1], by_column[2]), (by_row[0], by_row[1], by_row[2])
+    pitch = math.sqrt(_dot(dx, dx))
+    chord = np.empty(columns + 3)
     for n in range(len(centres)):
         # columns and rows count from here: they stay small, and the quadratics keep their digits
         jc, ic = round(column[n]), round(row[n])
         c = (centres[n, 0], centres[n, 1], centres[n, 2])
-        a1 = (shapes[n, 0, 0], shapes[n, 0, 1], shapes[n, 0, 2])
-        a2 = (shapes[n, 1, 0], shapes[n, 1, 1], shapes[n, 1, 2])
-        a3 = (shapes[n, 2, 0], shapes[n, 2, 1], shapes[n, 2, 2])
+        # half of the sample is above or below the image
+        reach = 1 + _reach(c, shapes[n]) / pitch
+        if not (-reach < ic < rows + reach and -reach < jc < columns + reach):
+            continue
+        a1, a2, a3 = _column(shapes[n], 0, turn), _column(shapes[n], 1, turn), _column(shapes[n], 2, turn)
         # adj(A) by rows: the cross products of the columns of A
         r1, r2, r3 = _cross(a2, a3), _cross(a3, a1), _cross(a1, a2)
         d = (
@@ -247,27 +288,31 @@ def _add_nodules(total, centres, shapes, column, row, d0, by_column, by_row):  #
             2 * (_dot(ex, ey) - _dot(gx, gy)),
             _dot(ey, ey) - _dot(gy, gy),
         )
-        # rows where the quadratic in x has real roots: another quadratic, in y
+        # rows where the quadratic in x has real roots: another quadratic, in y, and likewise the columns
         m0, m1, m2 = kx * kx - 4 * kxx * k0, kx * kxy - 2 * kxx * ky, kxy * kxy - 4 * kxx * kyy
-        inside = m1 * m1 - m0 * m2
-        if inside <= 0.0 or m2 >= 0.0:
+        n0, n1 = ky * ky - 4 * kyy * k0, ky * kxy - 2 * kyy * kx
+        high, wide = m1 * m1 - m0 * m2, n1 * n1 - n0 * m2
+        if high <= 0.0 or wide <= 0.0 or m2 >= 0.0:
             continue
-        half = math.sqrt(inside) / -m2
-        first = max(math.ceil(-m1 / m2 - half), -ic)
-        last = min(math.floor(-m1 / m2 + half), rows - 1 - ic)
-        twice_det = 2 * abs(_dot(a1, r1))
+        high, wide = math.sqrt(high) / -m2, math.sqrt(wide) / -m2
+        first, last = max(math.ceil(-m1 / m2 - high), -ic), min(math.floor(-m1 / m2 + high), rows - 1 - ic)
+        start, stop = max(math.ceil(-n1 / m2 - wide), -jc), min(math.floor(-n1 / m2 + wide), columns - 1 - jc)
+        if start > stop:
+            continue
+        twice_det, txx = 2 * abs(_dot(a1, r1)), _dot(ex, ex)
         for y in range(first, last + 1):
             # in this row: |e|^2 - |g|^2 = s0 + 2 sx x + kxx x^2, and |e|^2 = t0 + tx x + txx x^2
             s0, sx = k0 + y * (ky + y * kyy), (kx + y * kxy) / 2
             e = (e0[0] + y * ey[0], e0[1] + y * ey[1], e0[2] + y * ey[2])
-            t0, tx, txx = _dot(e, e), 2 * _dot(e, ex), _dot(ex, ex)
-            wide = math.sqrt(max(sx * sx - kxx * s0, 0.0)) / -kxx
-            start = max(math.ceil(-sx / kxx - wide), -jc)
-            stop = min(math.floor(-sx / kxx + wide), columns - 1 - jc)
-            for x in range(start, stop + 1):
-                # rounding at the rim may leave less than nothing
+            t0, tx = _dot(e, e), 2 * _dot(e, ex)
+            line = total[ic + y, jc + start : jc + stop + 1]
+            # four at a time; outside the ellipse there is less than nothing, and the chord is 0
+            for k in range((len(line) + 3) // 4 * 4):
+                x = start + k
                 square = max(s0 + x * (2 * sx + x * kxx), 0.0)
-                total[ic + y, jc + x] += twice_det * math.sqrt(square) / (t0 + x * (tx + x * txx))
+                chord[k] = twice_det * math.sqrt(square) / (t0 + x * (tx + x * txx))
+            for k in range(len(line)):
+                line[k] += chord[k]
 
 
 @numba.njit(cache=True, nogil=True)

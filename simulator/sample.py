@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from simulator.each_point import products
 from simulator.kinematics import Motion, rotation_matrix
 from simulator.microstructure import place
 from simulator.radiography import Body
@@ -29,11 +30,12 @@ def rest_body(scenario: Scenario) -> Body:
 
 def moved_body(body: Body, motion: Motion, step: int) -> Body:
     """Carry the sample along: vertices and centres move, each nodule takes the local affine map."""
+    centres, gradient = motion.carry(body.centres_mm, step)
     return Body(
         vertices_mm=motion.forward(body.vertices_mm, step),
         faces=body.faces,
-        centres_mm=motion.forward(body.centres_mm, step),
-        shapes_mm=motion.gradient(body.centres_mm, step) @ body.shapes_mm,
+        centres_mm=centres,
+        shapes_mm=products(gradient, body.shapes_mm),
     )
 
 

@@ -3,8 +3,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from simulator.ingredients import (
@@ -56,6 +57,35 @@ def test_inverse_undoes_a_composition(deformation, turns):
     points = material_points()
     motion = Composition((*deformation, *turns))
     np.testing.assert_allclose(motion.inverse(motion.forward(points, 0), 0), points, atol=1e-9)
+
+
+@FEW
+@given(st.lists(motions(), max_size=3), st.integers(0, 100))
+def test_positions_and_gradient_at_once_are_those_one_by_one(parts, seed):
+    # of three motions in any order sections may cross, where there is no position to compare
+    motion, points = Composition(tuple(parts)), material_points(seed)
+    try:
+        motion.forward(points, 0)
+    except MotionError:
+        assume(False)
+    for each in (motion, *parts[:1]):
+        position, gradient = each.carry(points, 0)
+        np.testing.assert_array_equal(position, each.forward(points, 0))
+        np.testing.assert_array_equal(gradient, each.gradient(points, 0))
+
+
+@FEW
+@given(beam_motions())
+def test_a_beam_follows_natural_cubic_splines_and_goes_on_by_their_tangents(beam):
+    """On the centre line there is no arm to turn: x = Z e_z + d(Z), and dx/dZ = e_z + d'(Z)."""
+    height = np.concatenate([beam.knot_mm, np.linspace(-9, 9, 91)])
+    spline = CubicSpline(beam.knot_mm, beam.displacement_mm[0], bc_type="natural")
+    inside = np.clip(height, -6, 6)
+    shift = spline(inside) + (height - inside)[:, None] * spline(inside, 1)
+    line = height[:, None] * [0.0, 0.0, 1.0]
+    moved, gradient = beam.carry(line, 0)
+    np.testing.assert_allclose(moved - line, shift, atol=1e-14)
+    np.testing.assert_allclose(gradient[:, :, 2] - [0.0, 0.0, 1.0], spline(inside, 1), atol=1e-14)
 
 
 @FEW

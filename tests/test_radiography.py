@@ -242,6 +242,16 @@ def test_cropping_the_geometry_crops_the_image(geometry, angle_rad, factor):
     np.testing.assert_allclose(binned, whole[:rows, :columns], atol=1e-4)
 
 
+@pytest.mark.parametrize("where", [(0, 2.0, 0), (0, -2.0, 0), (0, 0, 2.5), (0, 0, -2.5), (0, 2.0, 2.5)])
+def test_what_is_beside_the_image_leaves_no_trace_in_it(where):
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.4)
+    mesh.apply_translation(where)
+    beside = np.add(where, [[0.0, 0.1, 0.0], [0.0, 0.0, -0.1]])
+    matrix, graphite = path_lengths(body(mesh, beside, [0.1 * np.eye(3)] * 2), SCANNER, 0.0, 1)
+    assert not matrix.any()
+    assert not graphite.any()
+
+
 def test_nodules_take_their_place_from_the_matrix():
     mesh = trimesh.creation.box((1.0, 1.0, 1.0))
     nodule = {"centres": [[0.1, 0.0, -0.1]], "shapes": [0.3 * np.eye(3)]}
