@@ -36,7 +36,7 @@ FITTED = 64
 """Steps from which deviations are fitted, at most."""
 EVERY = 16
 """Steps after which deviations are fitted anew."""
-CHANGED = 0.2
+CHANGED = 0.05
 """Change of a step's scales, of their logarithm, from which on the filter goes over it again."""
 ROUNDS = 4
 """Times that the scales of a bend are found in turn with the bend."""
@@ -137,17 +137,16 @@ class LaggedFilter:
         to = self.space.to_amplitude
         return to @ mean, to @ covariance @ to.T
 
-    def fit(self) -> bool:
-        """Fit the deviations where it is time to; return whether it was. It takes as long as some steps."""
+    def fit(self) -> None:
+        """Fit the deviations where it is time to. It takes as long as some steps."""
         if not self._finds or self.steps < self._fitted + EVERY:
-            return False
+            return
         self._fitted = self.steps
         process, given = self._process(slice(max(self.steps - FITTED, 0), self.steps))
         found = process.fitted(given, 1)
         # the ends of a window are not those of the test
         shared = {name: getattr(found, name) for name in ("bend_voxel", "roughness", "apparent_voxel")}
         self._adopt(replace(self._deviations, **shared))
-        return True
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that it has to know to go on, but for what the last `FITTED` steps told."""

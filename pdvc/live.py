@@ -1,7 +1,7 @@
 """Follow a test while it runs: radiographs come into a folder, their motion goes to a record, one line for each.
 
-After the reference scan, `make_ready` prepares all that does not depend on the test and keeps it. `follow` then takes
-each radiograph as soon as it is whole (`pdvc.incoming`), finds the motion (`pdvc.tracker`), and adds it to the record
+After the reference scan, `make_ready` prepares all that does not depend on the test and keeps it. `follow` takes each
+radiograph as soon as it is whole (`pdvc.incoming`), finds the motion (`pdvc.tracker`), and adds it to the record
 (`pdvc.record`); when all that are planned are in, the whole test is measured as in `pdvc.protocol`.
 
 What the tracker knows is written beside the work before a line is added to the record, line included: a process that is
@@ -87,7 +87,7 @@ def follow(
             while follower.missing and time.monotonic() < heard + idle_s:
                 if follower.look(tell):
                     heard = time.monotonic()
-                elif not follower.settle():
+                else:
                     time.sleep(POLL_S)
             started = time.perf_counter()
             measurement = measure_into(file, follower.recorded(), options, work=folder, progress=progress)
@@ -146,10 +146,6 @@ class _Follower:
             self._take(arrival, tell)
         return bool(arrived or given_up)
 
-    def settle(self) -> bool:
-        """Use the time between radiographs; return whether there was something to do."""
-        return self._tracker.settle()
-
     def recorded(self) -> Experiment:
         """Return the experiment with all radiographs that have come, in the order of steps.
 
@@ -185,6 +181,8 @@ class _Follower:
         self.record.add(line)
         self._done.add(arrival.step)
         tell(line)
+        # after the motion is told, and not when there is time: what comes out must not depend on the clock
+        self._tracker.settle()
 
     def _say_lost(self, line: LostLine, tell: Callable[[StepLine | LostLine], None]) -> None:
         """Say that a radiograph cannot be used; once, however often the test is gone on with."""
@@ -218,6 +216,7 @@ class _Follower:
             self.record.add_text(line)
         told = {int(file.stem): Told(**_unpacked(file)) for file in sorted(self._folder.glob(f"*{_TOLD}"))}
         self._tracker.restore(state, told)
+        self._tracker.settle()
 
     def _told_file(self, step: int) -> Path:
         return self._folder / f"{step:05d}{_TOLD}"

@@ -92,10 +92,10 @@ class Tracker:
         with threadpool_limits(limits=1, user_api="blas"):
             return self._take(radiograph)
 
-    def settle(self) -> bool:
-        """Fit what the process is like, where it is time to; return whether it was. Best between radiographs."""
+    def settle(self) -> None:
+        """Fit what the process is like, where it is time to: between radiographs, as it takes as long as some."""
         with threadpool_limits(limits=1, user_api="blas"):
-            return self._known.fit()
+            self._known.fit()
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that has to be known to go on, but for what the last `FITTED` of `pdvc.lagged` steps told."""
