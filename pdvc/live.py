@@ -4,8 +4,8 @@ After the reference scan, `make_ready` prepares all that does not depend on the 
 radiograph as soon as it is whole (`pdvc.incoming`), finds the motion (`pdvc.tracker`), and adds it to the record
 (`pdvc.record`); when all that are planned are in, the whole test is measured as in `pdvc.protocol`.
 
-What the tracker knows is written beside the work before a line is added to the record, line included: a process that is
-killed and started again goes on with the radiograph that it had in hand, to the same numbers.
+What the tracker knows is kept before a line is added to the record, line included: a process that is killed and
+started again goes on with the radiograph that it had in hand, to the same numbers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pdvc.measurement import Measurement
 from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.progress import Progress, silent
 from pdvc.radiograph_table import TABLE
-from pdvc.record import LostLine, MeasurementLine, Record, StepLine, TestLine, read_record
+from pdvc.record import LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
 from pdvc.resumable import measure_into
 from pdvc.setup import Setup, set_up
 from pdvc.store import experiment_digest
@@ -77,11 +77,11 @@ def follow(
     Raises ExperimentError where the folder cannot be followed, ValueError where the test cannot be measured or the
     record belongs to another one, InUseError where another process is at the same file.
     """
-    folder = work or file.with_name(file.name + ".work")
-    with held(folder):
+    folder, kept = work or file.with_name(file.name + ".work"), file.with_name(file.name + ".live")
+    with held(folder), held(kept):
         compile_kernels(progress=progress)
         setup = set_up(experiment, options, work=folder, progress=progress)
-        follower = _Follower(setup, Tracker(setup, progress), radiographs, record_of(file), folder / "live")
+        follower = _Follower(setup, Tracker(setup, progress), radiographs, record_of(file), kept)
         try:
             heard = time.monotonic()
             while follower.missing and time.monotonic() < heard + idle_s:
@@ -94,6 +94,7 @@ def follow(
             follower.record.add(MeasurementLine(file=file.name, seconds=time.perf_counter() - started))
         finally:
             follower.record.close()
+        shutil.rmtree(kept, ignore_errors=True)
         if work is None:
             shutil.rmtree(folder, ignore_errors=True)
     return measurement
@@ -112,7 +113,7 @@ class _Follower:
         self._setup, self._tracker, self._radiographs, self._folder = setup, tracker, radiographs, folder
         self._key = digest("live", experiment_digest(setup.experiment), setup.options)
         self.record = Record(record)
-        first = TestLine(
+        first = PlanLine(
             title=setup.experiment.title,
             steps=len(setup.experiment.test),
             height_mm=tuple(setup.sections.height_mm.tolist()),
@@ -121,7 +122,6 @@ class _Follower:
         if self.record.lines:
             self._go_on()
         else:
-            shutil.rmtree(folder, ignore_errors=True)
             self.record.add(first)
         lines = list(read_record(record))
         self._done = {line.step for line in lines if isinstance(line, StepLine)}
@@ -201,15 +201,17 @@ class _Follower:
         """Know again what was known when the last line was written, or was about to be."""
         path = self._folder / _STATE
         if not path.is_file():
-            # killed before the first radiograph was in, unless the record is another test's
+            # killed before the first radiograph was in, unless there are lines of some
             if len(self.record.lines) > 1:
-                raise ValueError(f"{path}: expected what is needed to go on with the record, found none")
+                raise ValueError(
+                    f"{path}: expected what is needed to go on with the record, found none: choose another file"
+                )
             return
         state = _unpacked(path)
         if str(state["key"]) != self._key:
             raise ValueError(
                 f"{path}: expected the same reference scan, plan and options as now, found others: choose another "
-                "file for the measurement, or delete this one's record and work"
+                "file for the measurement"
             )
         line = str(state["line"])
         if line not in self.record.lines[-2:]:

@@ -27,7 +27,7 @@ then an upper bound.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numba
@@ -223,13 +223,18 @@ class StepNoise:
         shared = overlaid(both, noise.flat.shape)
         return cls(image=image, view=view, weighted=weighted, moved=moved, shared=shared)
 
-    def own(self, flat: Image, unknowns: int) -> dict[str, Floats]:
-        """Return V of the step alone, by `SOURCES`, for a variance of the mean flat (row, column)."""
-        return {
-            "radiographs": product(self.weighted, self.weighted, self.image.variance, unknowns),
-            "views": product(self.moved, self.moved, self.view.variance, unknowns),
-            "flats": product(self.shared, self.shared, flat, unknowns),
-        }
+    def own(self, flat: Image, unknowns: int, pool: Executor | None = None) -> dict[str, Floats]:
+        """Return V of the step alone, by `SOURCES`, for a variance of the mean flat (row, column).
+
+        With a pool, sources side by side.
+        """
+        met = (self.weighted, self.image.variance), (self.moved, self.view.variance), (self.shared, flat)
+
+        def of_source(each: tuple[Sensitivities, Image]) -> Floats:
+            return product(each[0], each[0], each[1], unknowns)
+
+        found = map(of_source, met) if pool is None else pool.map(of_source, met)
+        return dict(zip(SOURCES, found, strict=True))
 
 
 def meeting_noise(volume: Volume, smooth_px: float) -> Volume:

@@ -4,7 +4,7 @@ It is only ever added to, and each line is on the disk before the next radiograp
 whatever happens to the process, and anything may read it meanwhile. The first line tells what the others are about;
 `what` tells of each line which kind it is::
 
-    {"what": "test", "title": ..., "steps": 127, "height_mm": [...], "voxel_mm": 0.0107}
+    {"what": "plan", "title": ..., "steps": 127, "height_mm": [...], "voxel_mm": 0.0107}
     {"what": "step", "step": 0, "angle_deg": ..., "time_s": ..., "displacement_voxel": [[...], ...], ...}
     {"what": "lost", "step": 4, "file": "00004.tif", "reason": "..."}
     {"what": "measurement", "file": "motion.nc", "seconds": 312.0}
@@ -32,10 +32,10 @@ class Line:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TestLine(Line):
+class PlanLine(Line):
     """What is followed: the first line."""
 
-    what: ClassVar[str] = "test"
+    what: ClassVar[str] = "plan"
     title: str
     steps: int
     """Steps that are planned."""
@@ -105,7 +105,7 @@ class MeasurementLine(Line):
     seconds: float
 
 
-_KINDS: dict[str, type[Line]] = {each.what: each for each in (TestLine, StepLine, LostLine, MeasurementLine)}
+_KINDS: dict[str, type[Line]] = {each.what: each for each in (PlanLine, StepLine, LostLine, MeasurementLine)}
 
 
 class Record:

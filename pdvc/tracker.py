@@ -13,9 +13,11 @@ step alone a second time: intervals are rather too wide than too narrow.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
@@ -33,7 +35,8 @@ from pdvc.progress import Progress, silent
 from pdvc.residual_tests import residual_tests
 from pdvc.sensitivity_sums import adjoint, adjoints
 from pdvc.setup import Setup
-from pdvc.smoother import Smoother, seen
+from pdvc.smoother import WORSE, Smoother, seen
+from pdvc.solution import SHORTER
 from pdvc.state_space import StateSpace
 
 Floats = NDArray[np.float64]
@@ -41,8 +44,8 @@ Image = NDArray[np.float32]
 
 DRAWS = 24
 """Draws of the flats' noise that go along."""
-MOST_PASSES = 3
-"""Passes over one radiograph at one scale, at most."""
+MOST_CHANGES = 4
+"""Changes of the motion at one scale, at most."""
 COARSE_CHANGE = 0.1
 """Rms change of the amplitudes, over the pixel of a coarse scale, under which the next scale begins."""
 LEAST_CHANGE = 0.2
@@ -83,6 +86,7 @@ class Tracker:
         self._blurred = meeting_noise(self._rest[1].volume, self._noise.smooth_px)
         self._pattern = GrowingPattern(self._rest[1].systematic, self._noise)
         self._flats = _draws(self._noise)
+        self._pool = ThreadPoolExecutor(numba.get_num_threads())
         space, few = _space(setup, solver, None), _space(setup, solver, FITTED_MODES)
         self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS)
 
@@ -111,21 +115,23 @@ class Tracker:
         images = self._images(radiograph, pattern)
         fine, noise = images[1], self._noise_of(radiograph, pattern)
         amplitude, equations, passes = self._approached(images, radiograph.step)
-        told, image = self._told_by(fine, amplitude, equations, noise)
+        tests = self._pool.submit(
+            residual_tests,
+            *(fine.images, fine.systematic, self._basis, amplitude, noise, equations.residual, amplitude.size),
+        )
+        meets, told = self._told_by(fine, amplitude, equations, noise, pattern)
         self._known.add(radiograph.step, told)
         found, covariance = self._known.at(radiograph.step)
         together = found[:, 1:] / np.sqrt([1, *[DRAWS] * DRAWS])
         residual = equations.residual[0]
         if pattern is not None:
-            self._pattern.add(residual, pattern.grey[fine.systematic.window], image.image)
+            self._pattern.add(residual, pattern.grey[fine.systematic.window], meets.image)
         return Taken(
             amplitude=found[:, 0].reshape(self._basis.shape),
             covariance=covariance + together @ together.T,
             told=told,
             residual=residual,
-            tests=residual_tests(
-                fine.images, fine.systematic, self._basis, amplitude, noise, equations.residual, amplitude.size
-            ),
+            tests=tests.result(),
             passes=passes,
         )
 
@@ -137,7 +143,8 @@ class Tracker:
             time_s=np.array([radiograph.time_s]),
             force_N=np.array([radiograph.force_N]),
         )
-        images = {scale: with_radiographs(self._setup, rest, alone) for scale, rest in self._rest.items()}
+        found = self._pool.map(lambda rest: with_radiographs(self._setup, rest, alone), self._rest.values())
+        images = dict(zip(self._rest, found, strict=True))
         if pattern is not None:
             images[1] = images[1].without(pattern.grey)
         return images
@@ -151,46 +158,63 @@ class Tracker:
     def _approached(self, images: Mapping[int, Prepared], step: int) -> tuple[Floats, Equations, int]:
         """Return amplitudes (1, section, motion), voxels, the equations there at scale 1, and the number of passes."""
         expected, passes = self._known.expected(step), 0
-        at = self._known.space.to_amplitude @ expected.mean
+        starts = [self._known.space.to_amplitude @ expected.mean]
+        if step:
+            # after few steps what is expected may be further off than where the sample was
+            starts.append(self._known.at(step - 1)[0][:, 0])
+
+        def equations_at(scale: int, amplitude: Floats) -> Equations:
+            nonlocal passes
+            passes += 1
+            return linearise(images[scale].images, self._basis, amplitude.reshape(1, *self._basis.shape))
+
+        at = min(starts, key=lambda start: equations_at(max(images), start).chi2[0])
         for scale, prepared in images.items():
-            for _ in range(MOST_PASSES):
-                equations = linearise(prepared.images, self._basis, at.reshape(1, *self._basis.shape))
-                passes += 1
-                variance = float(prepared.noise_rms or 1) ** 2
+            equations, variance = equations_at(scale, at), float(prepared.noise_rms or 1) ** 2
+            for _ in range(MOST_CHANGES):
                 matrix, vector = equations.matrix[0] / variance, equations.vector[0] / variance
                 mean, covariance = self._known.weighed(expected, matrix, vector + matrix @ at)
                 size = LEAST_CHANGE * np.sqrt(np.diag(covariance)) if scale == 1 else COARSE_CHANGE * scale
-                change = float(np.sqrt(np.mean(((mean - at) / size) ** 2)))
-                # what the last pass tells is taken in where it was linearised
-                if scale == 1 and (change < 1 or passes == MOST_PASSES * len(images)):
+                small = np.sqrt(np.mean(((mean - at) / size) ** 2)) < 1
+                if small and scale > 1:
+                    at = mean
+                if small:
                     break
-                at = mean
-                if change < 1:
+                for share in SHORTER:
+                    moved = at + share * (mean - at)
+                    trial = equations_at(scale, moved)
+                    if trial.chi2[0] <= equations.chi2[0] * (1 + WORSE):
+                        break
+                else:
                     break
+                at, equations = moved, trial
         return at.reshape(1, *self._basis.shape), equations, passes
 
     def _told_by(
-        self, fine: Prepared, amplitude: Floats, equations: Equations, noise: Noise
-    ) -> tuple[Told, StepNoise]:
-        """Return what a radiograph told about amplitudes (1, section, motion), and what its noise meets."""
+        self, fine: Prepared, amplitude: Floats, equations: Equations, noise: Noise, pattern: Pattern | None
+    ) -> tuple[StepNoise, Told]:
+        """Return what a radiograph's noise meets at amplitudes (1, section, motion), and what it told."""
         images, systematic = replace(fine.images, volume=self._blurred), fine.systematic
         unknowns, rays = amplitude.size, images.rays
         sight = systematic.looked_along(slice(None), rays, self._basis, amplitude, images.voxel_mm)
         weighted = weighted_sensitivities(images, self._basis, amplitude, [0])[0]
         places = systematic.places(0, rays[0], self._basis, amplitude[0], images.voxel_mm)
         meets = StepNoise.of(noise, 0, sight.of_step(0), weighted, places, systematic.corner)
-        covariance = np.sum(list(meets.own(noise.flat, unknowns).values()), axis=0)
+        # the mean of what is left over the window is enough for what draws tell
+        left_of_flats = 1.0 if pattern is None else float(np.sqrt(pattern.left[systematic.window].mean()))
+        of_flats = self._pool.submit(adjoints, meets.shared, self._flats, unknowns)
+        covariance = np.sum(list(meets.own(noise.flat, unknowns, self._pool).values()), axis=0)
         left = registered_left(images, self._basis, amplitude, 0)
         believed = np.zeros(unknowns) if left is None else BELIEF * adjoint(weighted, left, unknowns)
-        of_flats = adjoints(meets.shared, self._flats * np.sqrt(noise.flat)[..., None], unknowns)
         data, white = seen(equations, covariance[None], amplitude.reshape(1, -1))
-        errors = white[0] @ np.column_stack([believed, of_flats])
-        return Told(design=data.design[0], data=data.data[0], errors=errors), meets
+        errors = white[0] @ np.column_stack([believed, left_of_flats * of_flats.result()])
+        return meets, Told(design=data.design[0], data=data.data[0], errors=errors)
 
 
 def _draws(noise: Noise) -> Image:
-    """Return draws of unit variance for the flats (row, column, draw), the same for all steps."""
-    return np.random.default_rng(0).standard_normal((*noise.flat.shape, DRAWS), dtype=np.float32)
+    """Return draws of the flats' noise (row, column, draw), relative to the open beam, the same for all steps."""
+    rng = np.random.default_rng(0)
+    return rng.standard_normal((*noise.flat.shape, DRAWS), dtype=np.float32) * np.sqrt(noise.flat)[..., None]
 
 
 def _space(setup: Setup, solver: Smoother, most_modes: int | None) -> StateSpace:

@@ -1,0 +1,221 @@
+"""A test followed while it runs: radiographs come in, their motion goes to a record, killed and gone on with."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from pdvc import live
+from pdvc.deviations import beam_frame
+from pdvc.experiment import Experiment, ExperimentError, read_experiment
+from pdvc.gauss_newton import GaussNewton
+from pdvc.incoming import IncomingWriter
+from pdvc.live import follow, make_ready, record_of
+from pdvc.options import MeasureOptions, StageOptions
+from pdvc.protocol import measure
+from pdvc.record import LostLine, MeasurementLine, PlanLine, StepLine, read_record
+from simulator.scanner import simulate
+from simulator.scenario import Scenario, course_of
+from tests.command_line import only_line, pdvc_bench
+from tests.tiny_scenarios import TINY
+
+STEPS = 25
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return Scenario.parse(tomllib.loads(TINY), where="tiny")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, scenario) -> Path:
+    path = tmp_path_factory.mktemp("live") / "experiment"
+    simulate(scenario, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def planned(folder) -> Experiment:
+    return read_experiment(folder, planned=True)
+
+
+@pytest.fixture(scope="module")
+def ready(planned, tmp_path_factory) -> Path:
+    """Return what prepare keeps."""
+    work = tmp_path_factory.mktemp("ready")
+    make_ready(planned, work=work)
+    return work
+
+
+def played(experiment: Path, to: Path, steps=range(STEPS)) -> Path:
+    """Write radiographs of the test into a folder, as a scanner does."""
+    test, writer = read_experiment(experiment).test, IncomingWriter(to)
+    for t in steps:
+        writer.write(t, test.counts[t], test.angle_rad[t], test.time_s[t], test.force_N[t])
+    return to
+
+
+@pytest.fixture(scope="module")
+def followed(folder, planned, ready, tmp_path_factory):
+    """Return the lines of a test that was followed without a break, and its measurement."""
+    path = tmp_path_factory.mktemp("followed")
+    told: list[StepLine | LostLine] = []
+    found = follow(planned, played(folder, path / "arriving"), path / "motion.nc", work=ready, tell=told.append)
+    lines = list(read_record(record_of(path / "motion.nc")))
+    assert lines[1:-1] == told
+    return lines, found
+
+
+def motions(lines) -> list[StepLine]:
+    """Return the motions of a record, without what depends on the clock."""
+    return [replace(line, seconds=0.0, unix_s=0.0) for line in lines if isinstance(line, StepLine)]
+
+
+def test_there_is_a_line_for_the_plan_for_each_radiograph_in_turn_and_for_the_measurement(followed, planned):
+    lines, _ = followed
+    assert isinstance(lines[0], PlanLine)
+    assert lines[0].steps == STEPS
+    assert [line.step for line in lines[1:-1]] == list(range(STEPS))
+    np.testing.assert_allclose([np.deg2rad(line.angle_deg) for line in lines[1:-1]], planned.test.angle_rad)
+    assert isinstance(lines[-1], MeasurementLine)
+
+
+def test_the_whole_test_is_measured_as_if_nothing_had_been_followed(followed, folder):
+    _, found = followed
+    alone = measure(read_experiment(folder))
+    # angles come through degrees
+    np.testing.assert_allclose(found.motion.amplitude, alone.motion.amplitude, atol=1e-5)
+    np.testing.assert_allclose(found.motion.amplitude_std, alone.motion.amplitude_std, rtol=1e-4)
+
+
+def test_stated_intervals_of_each_step_hold_for_the_true_motion(followed, scenario):
+    lines, _ = followed
+    motion, height = course_of(scenario).motion, np.array(lines[0].height_mm)
+    points = np.zeros((len(height), 3))
+    points[:, 2] = height
+    share, sizes = [], []
+    for line in motions(lines):
+        truth = (points - motion.inverse(points, line.step)) / lines[0].voxel_mm
+        error = np.array(line.displacement_voxel) - truth @ beam_frame(np.deg2rad(line.angle_deg)).T
+        share.append(np.abs(error / line.displacement_std) < 1.96)
+        sizes.append(np.abs(truth).max())
+    assert max(sizes) > 1
+    assert (np.mean(share, axis=(0, 1)) > 0.85).all()
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+@pytest.fixture
+def measured_never(monkeypatch):
+    """Kill the process when it begins to measure the whole test."""
+
+    def killed(*_, **__):
+        raise Killed
+
+    monkeypatch.setattr(live, "measure_into", killed)
+
+
+def follow_to_its_end(*arguments, **options) -> list[LostLine | StepLine]:
+    """Follow all radiographs, and be killed then; return the lines that were told."""
+    told: list[LostLine | StepLine] = []
+    with pytest.raises(Killed):
+        follow(*arguments, **options, tell=told.append)
+    return told
+
+
+def test_killed_anywhere_it_goes_on_to_the_same_numbers(
+    folder, planned, ready, followed, tmp_path, monkeypatch, measured_never
+):
+    arriving, file, lines = played(folder, tmp_path / "arriving"), tmp_path / "motion.nc", []
+    writes, kept = 0, live.write_whole
+
+    def killed_at(write: int):
+        def write_whole(path, content):
+            nonlocal writes
+            writes += 1
+            if writes == write:
+                raise Killed
+            kept(path, content)
+
+        return write_whole
+
+    def kill_after(line):
+        lines.append(line)
+        if len(lines) == 18:
+            raise Killed
+
+    # before what a radiograph told is kept, before what the tracker knows, and after its line
+    for write, tell in ((7, lines.append), (2, lines.append), (0, kill_after)):
+        writes = 0
+        monkeypatch.setattr(live, "write_whole", killed_at(write))
+        with pytest.raises(Killed):
+            follow(planned, arriving, file, work=ready, tell=tell)
+    # and while a line was written, which is then half there
+    record = record_of(file)
+    record.write_bytes(record.read_bytes()[:-40])
+    follow_to_its_end(planned, arriving, file, work=ready)
+    assert motions(read_record(record)) == motions(followed[0])
+
+
+def test_what_cannot_be_used_is_said_once_and_the_others_are_followed(
+    folder, planned, ready, tmp_path, measured_never
+):
+    arriving, file = played(folder, tmp_path / "arriving"), tmp_path / "motion.nc"
+    tifffile.imwrite(arriving / "00004.tif", np.zeros((3, 3), dtype=np.uint16))
+    with (arriving / "radiographs.csv").open("a", encoding="utf-8") as table:
+        table.write("many,00000.tif,0,0,0\n")
+    told = follow_to_its_end(planned, arriving, file, work=ready)
+    assert follow_to_its_end(planned, arriving, file, work=ready) == []
+    lines = list(read_record(record_of(file)))
+    lost = [line for line in lines if isinstance(line, LostLine)]
+    assert sorted(line.step for line in lost) == [-1, 4]
+    assert all("expected" in line.reason for line in lost)
+    assert lines[1:] == told
+    assert [line.step for line in motions(lines)] == [t for t in range(STEPS) if t != 4]
+
+
+def test_a_test_that_stops_early_is_measured_as_far_as_it_went(folder, planned, ready, tmp_path):
+    arriving = played(folder, tmp_path / "arriving", range(12))
+    found = follow(planned, arriving, tmp_path / "motion.nc", work=ready, idle_s=0.2)
+    assert found.recording.steps == 12
+
+
+def test_what_cannot_be_followed_is_refused(planned, ready, folder, tmp_path):
+    direct = MeasureOptions(deformation=(StageOptions(scale=1, solver=GaussNewton()),))
+    with pytest.raises(ValueError, match="deformation: expected kind = 'smoother' in the last stage"):
+        make_ready(planned, direct, work=tmp_path / "work")
+    with pytest.raises(ExperimentError, match="nowhere"):
+        follow(planned, tmp_path / "nowhere", tmp_path / "motion.nc", work=ready)
+    with pytest.raises(ValueError, match="noise: expected photons_per_count"):
+        make_ready(replace(planned, photons_per_count=None), work=tmp_path / "work")
+
+
+def test_a_record_of_another_test_is_not_gone_on_with(folder, planned, ready, tmp_path, measured_never):
+    arriving = played(folder, tmp_path / "arriving", range(3))
+    follow_to_its_end(planned, arriving, tmp_path / "motion.nc", work=ready, idle_s=0.2)
+    other = replace(planned, test=replace(planned.test, force_N=planned.test.force_N + 1))
+    with pytest.raises(ValueError, match="expected the same reference scan, plan and options as now"):
+        follow(other, arriving, tmp_path / "motion.nc", work=ready, idle_s=0.2)
+
+
+def test_the_commands(folder, tmp_path, followed):
+    work, arriving, file = tmp_path / "ready", tmp_path / "arriving", tmp_path / "motion.nc"
+    assert pdvc_bench("prepare", folder, "--work", work).exit_code == 0
+    assert pdvc_bench("play", folder, "--to", arriving, "--pace", 0).exit_code == 0
+    done = pdvc_bench("live", folder, "--radiographs", arriving, "--work", work, "-o", file, "--json")
+    assert done.exit_code == 0, done.stderr
+    lines = list(read_record(record_of(file)))
+    assert done.stdout.splitlines() == [line.text() for line in lines[1:-1]]
+    assert motions(lines) == motions(followed[0])
+    assert file.is_file()
+    # what was followed to its end has nothing to go on with
+    again = pdvc_bench("live", folder, "--radiographs", arriving, "--work", work, "-o", file)
+    assert again.exit_code != 0
+    assert "choose another file" in only_line(again)
