@@ -53,7 +53,7 @@ class Told:
     """X (unknown, unknown)."""
     data: Floats
     """y (unknown,)."""
-    errors: Floats
+    errors: NDArray[np.float32] | Floats
     """(unknown, error)."""
 
 

@@ -14,6 +14,7 @@ import io
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,25 +79,22 @@ def follow(
     record belongs to another one, InUseError where another process is at the same file.
     """
     folder, kept = work or file.with_name(file.name + ".work"), file.with_name(file.name + ".live")
-    with held(folder), held(kept):
+    with held(folder), held(kept), closing(Record(record_of(file))) as record:
         compile_kernels(progress=progress)
         setup = set_up(experiment, options, work=folder, progress=progress)
-        follower = _Follower(setup, Tracker(setup, progress), radiographs, record_of(file), kept)
-        try:
-            heard = time.monotonic()
-            while follower.missing and time.monotonic() < heard + idle_s:
-                if follower.look(tell):
-                    heard = time.monotonic()
-                else:
-                    time.sleep(POLL_S)
-            started = time.perf_counter()
-            measurement = measure_into(file, follower.recorded(), options, work=folder, progress=progress)
-            follower.record.add(MeasurementLine(file=file.name, seconds=time.perf_counter() - started))
-        finally:
-            follower.record.close()
-        shutil.rmtree(kept, ignore_errors=True)
-        if work is None:
-            shutil.rmtree(folder, ignore_errors=True)
+        follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept)
+        heard = time.monotonic()
+        while follower.missing and time.monotonic() < heard + idle_s:
+            if follower.look(tell):
+                heard = time.monotonic()
+            else:
+                time.sleep(POLL_S)
+        started = time.perf_counter()
+        measurement = measure_into(file, follower.recorded(), options, work=folder, progress=progress)
+        record.add(MeasurementLine(file=file.name, seconds=time.perf_counter() - started))
+    shutil.rmtree(kept, ignore_errors=True)
+    if work is None:
+        shutil.rmtree(folder, ignore_errors=True)
     return measurement
 
 
@@ -108,22 +106,22 @@ def record_of(file: Path) -> Path:
 class _Follower:
     """A test that is followed: what has come in, what the tracker knows, and the record."""
 
-    def __init__(self, setup: Setup, tracker: Tracker, radiographs: Path, record: Path, folder: Path) -> None:
+    def __init__(self, setup: Setup, tracker: Tracker, radiographs: Path, record: Record, folder: Path) -> None:
         """Begin, or go on where the record ends; raises ValueError where it belongs to another test."""
         self._setup, self._tracker, self._radiographs, self._folder = setup, tracker, radiographs, folder
         self._key = digest("live", experiment_digest(setup.experiment), setup.options)
-        self.record = Record(record)
+        self._record = record
         first = PlanLine(
             title=setup.experiment.title,
             steps=len(setup.experiment.test),
             height_mm=tuple(setup.sections.height_mm.tolist()),
             voxel_mm=setup.geometry.voxel_mm,
         )
-        if self.record.lines:
+        if self._record.lines:
             self._go_on()
         else:
-            self.record.add(first)
-        lines = list(read_record(record))
+            self._record.add(first)
+        lines = list(read_record(record.path))
         self._done = {line.step for line in lines if isinstance(line, StepLine)}
         self._lost = {line for line in lines if isinstance(line, LostLine)}
         # what was lost is looked at again, and said once
@@ -178,7 +176,7 @@ class _Follower:
             return
         line = _line(self._setup, arrival, taken, time.perf_counter() - started)
         self._keep(arrival.step, taken.told, line)
-        self.record.add(line)
+        self._record.add(line)
         self._done.add(arrival.step)
         tell(line)
         # after the motion is told, and not when there is time: what comes out must not depend on the clock
@@ -187,7 +185,7 @@ class _Follower:
     def _say_lost(self, line: LostLine, tell: Callable[[StepLine | LostLine], None]) -> None:
         """Say that a radiograph cannot be used; once, however often the test is gone on with."""
         if line not in self._lost:
-            self.record.add(line)
+            self._record.add(line)
             self._lost.add(line)
             tell(line)
 
@@ -202,7 +200,7 @@ class _Follower:
         path = self._folder / _STATE
         if not path.is_file():
             # killed before the first radiograph was in, unless there are lines of some
-            if len(self.record.lines) > 1:
+            if len(self._record.lines) > 1:
                 raise ValueError(
                     f"{path}: expected what is needed to go on with the record, found none: choose another file"
                 )
@@ -214,9 +212,12 @@ class _Follower:
                 "file for the measurement"
             )
         line = str(state["line"])
-        if line not in self.record.lines[-2:]:
-            self.record.add_text(line)
-        told = {int(file.stem): Told(**_unpacked(file)) for file in sorted(self._folder.glob(f"*{_TOLD}"))}
+        if line not in self._record.lines[-2:]:
+            self._record.add_text(line)
+        told = {
+            int(file.name.removesuffix(_TOLD)): Told(**_unpacked(file))
+            for file in sorted(self._folder.glob(f"*{_TOLD}"))
+        }
         self._tracker.restore(state, told)
         self._tracker.settle()
 

@@ -113,6 +113,7 @@ class Record:
 
     def __init__(self, path: Path) -> None:
         """Go on with a record, or begin one; half a line, left by a process that was killed, is taken away."""
+        self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("ab+")
         self._file.seek(0)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -34,18 +33,9 @@ def product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns:
 
 def adjoint(field: Sensitivities, image: Image, unknowns: int) -> Floats:
     """Return sum_p field(p) image(p), (unknown,)."""
-    return _over_rows(field, np.einsum("rck,rc->rk", field.values, image, dtype=float), unknowns)
-
-
-def adjoints(field: Sensitivities, images: Image, unknowns: int) -> Floats:
-    """Return the same of several images at once (row, column, image): (unknown, image)."""
-    return _over_rows(field, field.values.transpose(0, 2, 1) @ images, unknowns)
-
-
-def _over_rows(field: Sensitivities, of_rows: NDArray[np.floating[Any]], unknowns: int) -> Floats:
-    """Return the sum over rows of what each adds to its own sections (row, section * motion, ...)."""
+    of_rows = np.einsum("rck,rc->rk", field.values, image, dtype=float)
     # the last sections may have room beyond
-    found = np.zeros((unknowns + field.values.shape[2], *of_rows.shape[2:]))
+    found = np.zeros(unknowns + field.values.shape[2])
     for first, row in zip(field.first * field.motions, of_rows, strict=True):
         found[first : first + len(row)] += row
     return found[:unknowns]

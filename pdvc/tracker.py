@@ -5,9 +5,11 @@ the sample, coarse to fine, each pass weighed against what is expected; at scale
 which the filter then takes it in. The detector's fixed pattern is taken from it as far as the radiographs before it
 tell (`pdvc.pattern`).
 
-Steps have errors in common: those of the flats, and of e, believed to a share. Draws of them go through the filter
-beside the data, and the covariance of what comes out is added to what the filter knows. It holds what they do to each
-step alone a second time: intervals are rather too wide than too narrow.
+Steps have errors in common, which no step's own V tells: of the flats, of views that several look along, and of the
+model of the image. Whatever they are, they stay in their place on the sample or on the detector, so that blocks of
+pixels err independently of each other (`pdvc.coherent`). What each block told, L^-1 c_b, goes through the filter
+beside the data, as draws of white noise do. By how much more the blocks move the amplitudes of a motion than noise
+does, its intervals are widened. e, believed to a share, errs alike in all blocks: it goes along by itself.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pdvc.coherent import by_block, excess
 from pdvc.equations import Equations, linearise
 from pdvc.experiment import Series
 from pdvc.incoming import Arrival
@@ -33,17 +36,18 @@ from pdvc.preparation import Prepared, at_rest, radiograph_noise, stated_noise, 
 from pdvc.process import FITTED_MODES
 from pdvc.progress import Progress, silent
 from pdvc.residual_tests import residual_tests
-from pdvc.sensitivity_sums import adjoint, adjoints
+from pdvc.sensitivity_sums import adjoint
 from pdvc.setup import Setup
 from pdvc.smoother import WORSE, Smoother, seen
 from pdvc.solution import SHORTER
 from pdvc.state_space import StateSpace
+from pdvc.walk import BAND_ROWS, BLOCK_COLUMNS
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-DRAWS = 24
-"""Draws of the flats' noise that go along."""
+DRAWS = 32
+"""Draws of white noise that go along."""
 MOST_CHANGES = 4
 """Changes of the motion at one scale, at most."""
 COARSE_CHANGE = 0.1
@@ -85,10 +89,11 @@ class Tracker:
         self._noise, self._detector = stated_noise(setup, self._rest[1].systematic)
         self._blurred = meeting_noise(self._rest[1].volume, self._noise.smooth_px)
         self._pattern = GrowingPattern(self._rest[1].systematic, self._noise)
-        self._flats = _draws(self._noise)
         self._pool = ThreadPoolExecutor(numba.get_num_threads())
         space, few = _space(setup, solver, None), _space(setup, solver, FITTED_MODES)
-        self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS)
+        rows, columns = self._rest[1].systematic.shape
+        blocks = -(-rows // BAND_ROWS) * -(-columns // BLOCK_COLUMNS)
+        self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS + blocks)
 
     def take(self, radiograph: Arrival) -> Taken:
         """Take in a radiograph; raises Late of `pdvc.lagged` where its step is too far behind the newest."""
@@ -119,16 +124,15 @@ class Tracker:
             residual_tests,
             *(fine.images, fine.systematic, self._basis, amplitude, noise, equations.residual, amplitude.size),
         )
-        meets, told = self._told_by(fine, amplitude, equations, noise, pattern)
+        meets, told = self._told_by(fine, amplitude, equations, noise, radiograph.step)
         self._known.add(radiograph.step, told)
         found, covariance = self._known.at(radiograph.step)
-        together = found[:, 1:] / np.sqrt([1, *[DRAWS] * DRAWS])
         residual = equations.residual[0]
         if pattern is not None:
             self._pattern.add(residual, pattern.grey[fine.systematic.window], meets.image)
         return Taken(
             amplitude=found[:, 0].reshape(self._basis.shape),
-            covariance=covariance + together @ together.T,
+            covariance=covariance + self._in_common(found[:, 1:]),
             told=told,
             residual=residual,
             tests=tests.result(),
@@ -191,7 +195,7 @@ class Tracker:
         return at.reshape(1, *self._basis.shape), equations, passes
 
     def _told_by(
-        self, fine: Prepared, amplitude: Floats, equations: Equations, noise: Noise, pattern: Pattern | None
+        self, fine: Prepared, amplitude: Floats, equations: Equations, noise: Noise, step: int
     ) -> tuple[StepNoise, Told]:
         """Return what a radiograph's noise meets at amplitudes (1, section, motion), and what it told."""
         images, systematic = replace(fine.images, volume=self._blurred), fine.systematic
@@ -200,21 +204,22 @@ class Tracker:
         weighted = weighted_sensitivities(images, self._basis, amplitude, [0])[0]
         places = systematic.places(0, rays[0], self._basis, amplitude[0], images.voxel_mm)
         meets = StepNoise.of(noise, 0, sight.of_step(0), weighted, places, systematic.corner)
-        # the mean of what is left over the window is enough for what draws tell
-        left_of_flats = 1.0 if pattern is None else float(np.sqrt(pattern.left[systematic.window].mean()))
-        of_flats = self._pool.submit(adjoints, meets.shared, self._flats, unknowns)
         covariance = np.sum(list(meets.own(noise.flat, unknowns, self._pool).values()), axis=0)
         left = registered_left(images, self._basis, amplitude, 0)
         believed = np.zeros(unknowns) if left is None else BELIEF * adjoint(weighted, left, unknowns)
         data, white = seen(equations, covariance[None], amplitude.reshape(1, -1))
-        errors = white[0] @ np.column_stack([believed, left_of_flats * of_flats.result()])
+        draws = np.random.default_rng((0, step)).standard_normal((unknowns, DRAWS))
+        blocks = by_block(equations.blocks, white, np.ones((1, 1)))[0]
+        errors = np.column_stack([white[0] @ believed, draws, blocks]).astype(np.float32)
         return meets, Told(design=data.design[0], data=data.data[0], errors=errors)
 
-
-def _draws(noise: Noise) -> Image:
-    """Return draws of the flats' noise (row, column, draw), relative to the open beam, the same for all steps."""
-    rng = np.random.default_rng(0)
-    return rng.standard_normal((*noise.flat.shape, DRAWS), dtype=np.float32) * np.sqrt(noise.flat)[..., None]
+    def _in_common(self, moved: Floats) -> Floats:
+        """Return the covariance (unknown, unknown) of what steps have in common, by what errors do (unknown, error)."""
+        believed, draws, blocks = np.split(moved, [1, 1 + DRAWS], axis=1)
+        noise = draws @ draws.T / DRAWS
+        more = np.sqrt(excess(blocks**2, np.diag(noise), self._basis.shape))
+        larger = np.tile(more, self._basis.shape[0])
+        return np.asarray(believed @ believed.T + noise * (np.outer(larger, larger) - 1))
 
 
 def _space(setup: Setup, solver: Smoother, most_modes: int | None) -> StateSpace:
