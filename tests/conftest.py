@@ -1,11 +1,18 @@
-"""Count the examples that laws are tried on, and tell how many at the end."""
+"""Count the examples of laws, and tell how many at the end; keep threads from waiting for each other."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from functools import wraps
 
 import pytest
+
+# Read when numpy and numba are loaded, here and in what tests start. Two workers on two cores have each twice as many
+# threads as it has cores: on small matrices OpenBLAS then spends ten times as long waiting as it computes, and OpenMP
+# waits in a loop for the next kernel. Numba keeps its threads: the kernels' results must not depend on them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
