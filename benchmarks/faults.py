@@ -20,6 +20,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -201,6 +202,7 @@ def stage(folder: Path) -> str:
     return told(folder).partition(":")[0].partition(",")[0]
 
 
+@cache
 def to_begin_s() -> float:
     """Return how long a command takes before it does anything, s."""
     began = time.perf_counter()

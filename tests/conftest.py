@@ -1,15 +1,48 @@
-"""Count the examples that laws are tried on, and tell how many at the end."""
+"""Count the examples of laws, and tell how many at the end; keep workers and threads from waiting for each other."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import wraps
 
 import pytest
 
+# Read when numpy and numba are loaded, here and in what tests start. Two workers on two cores have each twice as many
+# threads as it has cores: on small matrices OpenBLAS then spends ten times as long waiting as it computes, and OpenMP
+# waits in a loop for the next kernel. Numba keeps its threads: the kernels' results must not depend on them.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+LONGEST = ("kills", "laws", "study", "examples", "package", "compare", "public", "tied_contraction", "noise", "store")
+"""Files that take longest: begun first, so that no worker ends with one of them while the others have nothing left."""
+KERNELS = """
+from pdvc.compilation import compile_comparison, compile_kernels
+from validation.testing.small_cases import SmallExperiment, small_scenario
+
+compile_kernels()
+compile_comparison()
+SmallExperiment(small_scenario()).measurement
+"""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the kernels once, before workers do so each by itself; hand out files in the order below.
+
+    What does not compile is left to the tests.
+    """
+    if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
+        config.option.loadscopereorder = False  # those with the most tests first, whatever they take
+        paths = os.pathsep.join([str(config.rootpath), os.environ.get("PYTHONPATH", "")])
+        subprocess.run([sys.executable, "-c", KERNELS], env={**os.environ, "PYTHONPATH": paths}, check=False)
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Count each call of what hypothesis calls with its examples."""
+    """Begin with the longest files, and count each call of what hypothesis calls with its examples."""
+    place = {f"test_{name}": k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
     for item in items:
         handle = getattr(getattr(item, "obj", None), "hypothesis", None)
         if handle is not None and not hasattr(handle.inner_test, "examples"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from tests.tiny_scenarios import trial
 from validation.scoring.bound import bound_of
 from validation.scoring.interval_calibration import (
     ONSET_STEPS,
+    _covered,
     crps,
     interval_calibration,
     phase_steps,
@@ -103,6 +104,13 @@ def test_errors_drawn_from_the_covariance_are_covered_as_they_should_be():
     assert {one.nees_unknowns for one in found} == {unknowns}
     # chi-square with so many degrees of freedom has variance twice their number
     assert np.mean([one.nees for one in found]) == pytest.approx(unknowns, abs=4 * np.sqrt(2 * unknowns / 60))
+
+
+@pytest.mark.parametrize(("level", "half"), [(0.5, 0.6745), (0.9, 1.6449), (0.95, 1.9600)])
+def test_intervals_are_as_wide_as_the_table_of_the_normal_distribution_says(level, half):
+    """An error just inside is covered, one just outside is not: draws know the share to some hundredths alone."""
+    found = _covered([half + np.array([-1e-3, 1e-3])] * 4, level)
+    assert {*astuple(found)} == {0.5}
 
 
 def test_an_interval_half_as_wide_as_due_shows():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,21 @@ from validation.scoring.scores import point_errors
 def case():
     truth, amplitude = records.stretched(*records.tensile_history())
     return records.measurement(amplitude, unobserved=(8,)), truth
+
+
+def test_a_figure_is_written_as_matplotlib_would_write_it(case, tmp_path):
+    """Colour bars too, which take their place from the layout."""
+    measurement, _ = case
+    written = []
+    for name in ("ours", "theirs"):
+        figure, axes = figures.new_figure(8, 4, 3)
+        figures.draw_residuals(measurement.fit.residual_initial[[3, 12, 20]], ["a", "b", "c"], axes, limit=1.0)
+        if name == "ours":
+            text = figures.save(figure, tmp_path / name, dpi=70)
+        else:
+            figure.savefig(tmp_path / name, dpi=70, format="png")
+        written.append((tmp_path / name).read_bytes())
+    assert written[0] == written[1] == base64.b64decode(text)
 
 
 def test_residuals_of_a_row_share_one_symmetric_scale(case):

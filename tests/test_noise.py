@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -46,8 +47,12 @@ def systematic(*, alone: bool = False) -> Systematic:
 ALONE, AROUND = systematic(alone=True), systematic()
 
 
+@cache
 def uneven(seed: int, level: float) -> ImageNoise:
-    """Return a noise that differs from row to row and column to column, and from image to image."""
+    """Return a noise that differs from row to row and column to column, and from image to image.
+
+    Kept, as every draw asks for that of every image.
+    """
     row, column = np.indices(SHAPE) / 40
     variance = level**2 * (1 + 0.5 * np.sin(seed + 3 * row) * np.cos(2 * column))
     slope = 1 + 0.3 * np.cos(seed + row + column)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -84,7 +85,7 @@ class Case:
     seen: Seen
     deviations: Deviations
 
-    @property
+    @cached_property
     def space(self) -> StateSpace:
         return StateSpace(self.basis, self.time_s, self.trend, contraction_of_strain=self.tied, prior_voxel=PRIOR)
 

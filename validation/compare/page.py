@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -30,6 +29,7 @@ from validation.compare.tables import (
     step_rows,
 )
 from validation.methods.registry import Method
+from validation.report.figures import save
 from validation.report.template import template
 from validation.scoring.bootstrap import LEAST_REPETITIONS
 
@@ -191,8 +191,7 @@ def _pictures(folder: Path, scenario: str, methods: Sequence[Method], summary: S
 
 
 def _picture(path: Path, caption: str, figure: Figure) -> Picture:
-    figure.savefig(path, dpi=120)
-    return Picture(name=path.stem, caption=caption, data=base64.b64encode(path.read_bytes()).decode("ascii"))
+    return Picture(name=path.stem, caption=caption, data=save(figure, path, dpi=120))
 
 
 def _page(methods: Sequence[Method], chapters: Sequence[Chapter], summary: Summary, where: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from pdvc.experiment import Experiment
 from pdvc.measurement import Measurement
 from pdvc.verdict import listed
+from validation.report.figures import save
 from validation.report.pictures import of_volumes, pictures
 from validation.report.sentences import (
     calibration_sentences,
@@ -60,9 +60,7 @@ def write_report(
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     shown = []
     for picture in pictures(measurement, experiment, truth):
-        path = folder / "figures" / f"{picture.name}.png"
-        picture.figure.savefig(path, dpi=130)
-        data = base64.b64encode(path.read_bytes()).decode("ascii")
+        data = save(picture.figure, folder / "figures" / f"{picture.name}.png", dpi=130)
         shown.append({"name": picture.name, "caption": picture.caption, "data": data})
     page = folder / "report.html"
     partial = page.with_name(page.name + ".partial")

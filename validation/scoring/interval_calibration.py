@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from pdvc.deviations import Quantities
 from pdvc.measurement import Measurement
@@ -107,7 +107,8 @@ def crps(error: Floats, deviation: Floats) -> Floats:
     """Return the continuous ranked probability score of normal distributions, where both are known (number,)."""
     known = np.isfinite(error) & (deviation > 0)
     z, spread = error[known] / deviation[known], deviation[known]
-    score = z * (2 * stats.norm.cdf(z) - 1) + 2 * stats.norm.pdf(z) - 1 / math.sqrt(math.pi)
+    density = np.exp(-(z**2) / 2) / math.sqrt(2 * math.pi)
+    score = z * (2 * special.ndtr(z) - 1) + 2 * density - 1 / math.sqrt(math.pi)
     return np.asarray(spread * score)
 
 
@@ -137,7 +138,7 @@ def _z_rms(scores: Sequence[Floats]) -> Quantities:
 
 
 def _covered(scores: Sequence[Floats], level: float) -> Quantities:
-    half = float(stats.norm.ppf((1 + level) / 2))
+    half = float(special.ndtri((1 + level) / 2))
     return _each([_mean(np.abs(z) < half) for z in scores])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pandas as pd
 
 from validation.batch.doubts import doubted
 from validation.batch.engine import FAILED
+from validation.report.figures import save
 from validation.report.template import template
 from validation.scoring.bootstrap import Estimate
 from validation.study.coverage import DIRECTIONS, Honesty, coverage_table, honesty, verdict
@@ -51,9 +51,7 @@ def write_study_report(
     pictures = []
     drawn = [*([resolution_picture(resolved)] if resolved else []), *score_pictures(study, scores)]
     for picture in (*drawn, *study_pictures(study, summary)):
-        path = folder / "figures" / f"{picture.name}.png"
-        picture.figure.savefig(path, dpi=120)
-        data = base64.b64encode(path.read_bytes()).decode("ascii")
+        data = save(picture.figure, folder / "figures" / f"{picture.name}.png", dpi=120)
         pictures.append({"name": picture.name, "caption": picture.caption, "data": data})
     page = folder / "study.html"
     partial = page.with_name("study.html.partial")
