@@ -30,13 +30,13 @@ Floats = NDArray[np.float64]
 
 WINDOW = 40
 """Steps whose scales are found anew at each step."""
-LAG = 20
+LAG = 12
 """Steps that the filter goes over again."""
 FITTED = 64
 """Steps from which deviations are fitted, at most."""
 EVERY = 16
 """Steps after which deviations are fitted anew."""
-CHANGED = 0.05
+CHANGED = 0.1
 """Change of a step's scales, of their logarithm, from which on the filter goes over it again."""
 ROUNDS = 4
 """Times that the scales of a bend are found in turn with the bend."""

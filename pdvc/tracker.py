@@ -14,9 +14,10 @@ does, its intervals are widened. e, believed to a share, errs alike in all block
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numba
@@ -35,6 +36,7 @@ from pdvc.pattern import GrowingPattern, Pattern
 from pdvc.preparation import Prepared, at_rest, radiograph_noise, stated_noise, with_radiographs
 from pdvc.process import FITTED_MODES
 from pdvc.progress import Progress, silent
+from pdvc.projection import BlockVectors
 from pdvc.residual_tests import residual_tests
 from pdvc.sensitivity_sums import adjoint
 from pdvc.setup import Setup
@@ -48,10 +50,14 @@ Image = NDArray[np.float32]
 
 DRAWS = 32
 """Draws of white noise that go along."""
+MERGED = 2
+"""Blocks of pixels down and across that are taken together."""
 MOST_CHANGES = 4
 """Changes of the motion at one scale, at most."""
 COARSE_CHANGE = 0.1
 """Rms change of the amplitudes, over the pixel of a coarse scale, under which the next scale begins."""
+NEAR = 2.0
+"""Rms residual at scale 2, over the radiograph's noise, under which the sample is not far from where it is sought."""
 LEAST_CHANGE = 0.2
 """The same at scale 1, over their standard deviations, under which a pass was the last one."""
 
@@ -92,7 +98,7 @@ class Tracker:
         self._pool = ThreadPoolExecutor(numba.get_num_threads())
         space, few = _space(setup, solver, None), _space(setup, solver, FITTED_MODES)
         rows, columns = self._rest[1].systematic.shape
-        blocks = -(-rows // BAND_ROWS) * -(-columns // BLOCK_COLUMNS)
+        blocks = -(-rows // (MERGED * BAND_ROWS)) * -(-columns // (MERGED * BLOCK_COLUMNS))
         self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS + blocks)
 
     def take(self, radiograph: Arrival) -> Taken:
@@ -118,7 +124,7 @@ class Tracker:
     def _take(self, radiograph: Arrival) -> Taken:
         pattern = self._pattern.found() if self._setup.options.remove_pattern else None
         images = self._images(radiograph, pattern)
-        fine, noise = images[1], self._noise_of(radiograph, pattern)
+        fine, noise = images(1), self._noise_of(radiograph, pattern)
         amplitude, equations, passes = self._approached(images, radiograph.step)
         tests = self._pool.submit(
             residual_tests,
@@ -139,19 +145,21 @@ class Tracker:
             passes=passes,
         )
 
-    def _images(self, radiograph: Arrival, pattern: Pattern | None) -> dict[int, Prepared]:
-        """Return a radiograph at each scale, the coarsest first."""
+    def _images(self, radiograph: Arrival, pattern: Pattern | None) -> Callable[[int], Prepared]:
+        """Return the function that gives a radiograph at a scale, prepared when it is first asked for."""
         alone = Series(
             counts=radiograph.counts[None],
             angle_rad=np.array([radiograph.angle_rad]),
             time_s=np.array([radiograph.time_s]),
             force_N=np.array([radiograph.force_N]),
         )
-        found = self._pool.map(lambda rest: with_radiographs(self._setup, rest, alone), self._rest.values())
-        images = dict(zip(self._rest, found, strict=True))
-        if pattern is not None:
-            images[1] = images[1].without(pattern.grey)
-        return images
+
+        @cache
+        def at(scale: int) -> Prepared:
+            found = with_radiographs(self._setup, self._rest[scale], alone)
+            return found.without(pattern.grey) if pattern is not None and scale == 1 else found
+
+        return at
 
     def _noise_of(self, radiograph: Arrival, pattern: Pattern | None) -> Noise:
         """Return the noise of a radiograph, as that of step 0, of the views and of the flats."""
@@ -159,7 +167,7 @@ class Tracker:
         flat = self._noise.flat if pattern is None else self._noise.flat * pattern.left
         return replace(self._noise, step=lambda _: own, flat=flat)
 
-    def _approached(self, images: Mapping[int, Prepared], step: int) -> tuple[Floats, Equations, int]:
+    def _approached(self, images: Callable[[int], Prepared], step: int) -> tuple[Floats, Equations, int]:
         """Return amplitudes (1, section, motion), voxels, the equations there at scale 1, and the number of passes."""
         expected, passes = self._known.expected(step), 0
         starts = [self._known.space.to_amplitude @ expected.mean]
@@ -167,14 +175,21 @@ class Tracker:
             # after few steps what is expected may be further off than where the sample was
             starts.append(self._known.at(step - 1)[0][:, 0])
 
-        def equations_at(scale: int, amplitude: Floats) -> Equations:
+        def pass_at(scale: int, amplitude: Floats) -> Equations:
             nonlocal passes
             passes += 1
-            return linearise(images[scale].images, self._basis, amplitude.reshape(1, *self._basis.shape))
+            return linearise(images(scale).images, self._basis, amplitude.reshape(1, *self._basis.shape))
 
-        at = min(starts, key=lambda start: equations_at(max(images), start).chi2[0])
-        for scale, prepared in images.items():
-            equations, variance = equations_at(scale, at), float(prepared.noise_rms or 1) ** 2
+        scales = sorted(self._rest, reverse=True)
+        second = scales[-2:][0]
+        tried = [(pass_at(second, start), start) for start in starts]
+        equations, at = min(tried, key=lambda each: float(each[0].chi2[0]))
+        # coarser scales are for what is far off
+        near = equations.rms < NEAR * float(images(second).noise_rms or 1)
+        for scale in scales[scales.index(second) if near else 0 :]:
+            variance = float(images(scale).noise_rms or 1) ** 2
+            if not (near and scale == second):
+                equations = pass_at(scale, at)
             for _ in range(MOST_CHANGES):
                 matrix, vector = equations.matrix[0] / variance, equations.vector[0] / variance
                 mean, covariance = self._known.weighed(expected, matrix, vector + matrix @ at)
@@ -186,7 +201,7 @@ class Tracker:
                     break
                 for share in SHORTER:
                     moved = at + share * (mean - at)
-                    trial = equations_at(scale, moved)
+                    trial = pass_at(scale, moved)
                     if trial.chi2[0] <= equations.chi2[0] * (1 + WORSE):
                         break
                 else:
@@ -209,17 +224,26 @@ class Tracker:
         believed = np.zeros(unknowns) if left is None else BELIEF * adjoint(weighted, left, unknowns)
         data, white = seen(equations, covariance[None], amplitude.reshape(1, -1))
         draws = np.random.default_rng((0, step)).standard_normal((unknowns, DRAWS))
-        blocks = by_block(equations.blocks, white, np.ones((1, 1)))[0]
+        blocks = _merged(by_block(equations.blocks, white, np.ones((1, 1)))[0], equations.blocks[0])
         errors = np.column_stack([white[0] @ believed, draws, blocks]).astype(np.float32)
         return meets, Told(design=data.design[0], data=data.data[0], errors=errors)
 
     def _in_common(self, moved: Floats) -> Floats:
-        """Return the covariance (unknown, unknown) of what steps have in common, by what errors do (unknown, error)."""
+        """Return the covariance (unknown, unknown) of what steps have in common: `moved` by errors (unknown, error)."""
         believed, draws, blocks = np.split(moved, [1, 1 + DRAWS], axis=1)
         noise = draws @ draws.T / DRAWS
         more = np.sqrt(excess(blocks**2, np.diag(noise), self._basis.shape))
         larger = np.tile(more, self._basis.shape[0])
         return np.asarray(believed @ believed.T + noise * (np.outer(larger, larger) - 1))
+
+
+def _merged(values: Floats, blocks: BlockVectors) -> Floats:
+    """Return sums (unknown, larger block) of what blocks tell (unknown, block): `MERGED` by `MERGED` of them."""
+    bands, columns, _ = blocks.values.shape
+    grid = values.reshape(-1, bands, columns)
+    for axis in (1, 2):
+        grid = np.add.reduceat(grid, np.arange(0, grid.shape[axis], MERGED), axis=axis)
+    return grid.reshape(len(values), -1)
 
 
 def _space(setup: Setup, solver: Smoother, most_modes: int | None) -> StateSpace:

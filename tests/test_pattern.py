@@ -9,7 +9,7 @@ import pytest
 
 from pdvc.equations import residuals
 from pdvc.noise import ImageNoise, Noise
-from pdvc.pattern import MOST, fixed_pattern
+from pdvc.pattern import MOST, GrowingPattern, fixed_pattern
 from pdvc.radiographs import noise_overlap, smoothed
 from pdvc.systematic import Systematic
 from tests.small_case import ANGLES, SECTIONS, SHAPE, STEPS, motion, radiographs
@@ -118,3 +118,28 @@ def test_without_the_flats_noise_nothing_is_taken():
     images, systematic = seen(drawn())
     pattern, _ = found(images, systematic, replace(noise(), flat=np.zeros(SHAPE, np.float32)))
     assert not pattern.grey.any()
+
+
+def test_radiographs_in_turn_tell_it_nearly_as_well_as_all_together():
+    psi = drawn()
+    images, systematic = seen(psi, OWN)
+    growing, errors = GrowingPattern(systematic, noise()), []
+    for t in range(STEPS):
+        taken = growing.found().grey
+        one = slice(t, t + 1)
+        alike = replace(images, grey=images.grey[one] - taken, rays=images.rays[one])
+        known = replace(systematic, left=lambda _, taken=taken: taken - psi, step_rad=ANGLES[one])
+        rho = residuals(replace(alike, systematic=known), SECTIONS, AMPLITUDE[one])[0]
+        growing.add(rho, taken, noise().step(t))
+        errors.append(float(np.std(growing.found().grey - psi)))
+    together, _ = found(images, systematic)
+    assert errors[-1] < 0.8 * errors[0] < 0.8 * psi.std()
+    assert errors[-1] < 1.15 * np.std(together.grey - psi)
+    np.testing.assert_allclose(growing.found().left, together.left, rtol=1e-6)
+
+
+def test_before_the_first_radiograph_nothing_is_known_of_it():
+    _, systematic = seen(drawn())
+    nothing = GrowingPattern(systematic, noise()).found()
+    assert not nothing.grey.any()
+    assert (nothing.left == 1).all()

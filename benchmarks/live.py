@@ -1,0 +1,155 @@
+"""A test played into a folder and followed from there: latency, errors, intervals: python -m benchmarks.live SCENARIO.
+
+`play` and `live` run as a user runs them, each a process of its own. Latency is counted from when the TIFF of a
+radiograph was whole on the disk to when its line of the record was. With `--kills N`, `live` is killed with SIGKILL N
+times, at moments drawn at random, and started again each time; latencies are then those of what was left undone. What
+is prepared is kept in the folder. The measurement of the whole test, at the end, is left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from benchmarks.timing import machine
+from pdvc.deviations import beam_frame
+from pdvc.live import record_of
+from pdvc.record import LostLine, PlanLine, StepLine, read_record
+from simulator.scanner import simulate
+from simulator.scenario import course_of, load_scenario
+from validation.report.figures import BLUE, TRUTH, new_figure, save
+
+BENCH = (sys.executable, "-m", "validation.cli")
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenario")
+    parser.add_argument("--pace", type=float, default=2.0, help="seconds between radiographs")
+    parser.add_argument("--kills", type=int, default=0)
+    parser.add_argument("--folder", type=Path, default=Path("out/live"))
+    parser.add_argument("--figure", type=Path)
+    options = parser.parse_args()
+    folder, experiment = options.folder / options.scenario, options.folder / options.scenario / "experiment"
+    scenario = load_scenario(options.scenario)
+    print(machine())
+    started = time.perf_counter()
+    simulate(scenario, experiment)
+    print(f"simulate: {time.perf_counter() - started:.0f} s", flush=True)
+    started = time.perf_counter()
+    subprocess.run([*BENCH, "prepare", experiment, "--work", folder / "ready"], check=True, stderr=subprocess.DEVNULL)
+    print(f"prepare: {time.perf_counter() - started:.0f} s", flush=True)
+    arriving, file = folder / "arriving", folder / "motion.nc"
+    for old in (arriving, file.with_name(file.name + ".live")):
+        shutil.rmtree(old, ignore_errors=True)
+    record_of(file).unlink(missing_ok=True)
+    peak = _followed(experiment, arriving, folder / "ready", file, options.pace, options.kills)
+    lines = list(read_record(record_of(file)))
+    _tell(lines, arriving, peak)
+    error, deviation, course = _against_truth(lines, scenario)
+    _tell_errors(error, deviation)
+    if options.figure:
+        _draw(lines, course, options.figure)
+
+
+def _followed(experiment: Path, arriving: Path, ready: Path, file: Path, pace_s: float, kills: int) -> float:
+    """Play and follow until the record holds all steps; return the largest memory of `live`, GiB."""
+    arriving.mkdir(parents=True)
+    live = [*BENCH, "live", experiment, "--radiographs", arriving, "--work", ready, "-o", file]
+    follower = subprocess.Popen(live, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    # the test begins once everything is loaded
+    while not record_of(file).is_file():
+        time.sleep(0.1)
+    player = subprocess.Popen(
+        [*BENCH, "play", experiment, "--to", arriving, "--pace", str(pace_s)], stderr=subprocess.DEVNULL
+    )
+    rng, peak, wait_s, since = np.random.default_rng(0), 0.0, 0.0, time.monotonic()
+    while not _whole(file):
+        time.sleep(0.05)
+        peak = max(peak, psutil.Process(follower.pid).memory_info().rss / 2**30)
+        wait_s = wait_s or rng.uniform(5, 25)
+        if kills and time.monotonic() > since + wait_s:
+            os.kill(follower.pid, signal.SIGKILL)
+            follower.wait()
+            follower = subprocess.Popen(live, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            kills, wait_s, since = kills - 1, 0.0, time.monotonic()
+            print(f"killed after {sum(isinstance(line, StepLine) for line in read_record(record_of(file)))} steps")
+    follower.kill()
+    for process in (follower, player):
+        process.wait()
+    return peak
+
+
+def _whole(file: Path) -> bool:
+    """Return whether each planned step has a line."""
+    lines = list(read_record(record_of(file)))
+    plan = [line for line in lines if isinstance(line, PlanLine)]
+    return bool(plan) and len({line.step for line in lines if isinstance(line, StepLine | LostLine)}) >= plan[0].steps
+
+
+def _tell(lines: list, arriving: Path, peak_gib: float) -> None:
+    steps = [line for line in lines if isinstance(line, StepLine)]
+    latency = np.array([line.unix_s - (arriving / line.file).stat().st_mtime for line in steps])
+    work = np.array([line.seconds for line in steps])
+    print(f"steps: {len(steps)}, each once: {len({line.step for line in steps}) == len(steps)}; passes: ", end="")
+    print(f"{np.mean([line.passes for line in steps]):.1f}; peak memory of live: {peak_gib:.1f} GiB")
+    for name, seconds in (("latency", latency), ("work", work)):
+        quantiles = np.quantile(seconds, (0.5, 0.99, 1))
+        print(f"{name}: median {quantiles[0]:.2f} s, 99 % {quantiles[1]:.2f} s, largest {quantiles[2]:.2f} s")
+
+
+def _against_truth(lines: list, scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
+    """Return errors and stated deviations (step, section, 4), voxels and strain, and the true mean strain (step,)."""
+    plan, motion = lines[0], course_of(scenario).motion
+    height = np.array(plan.height_mm)
+    points = np.zeros((len(height), 3))
+    points[:, 2] = height
+    errors, deviations, course = [], [], []
+    for line in (line for line in lines if isinstance(line, StepLine)):
+        moved = points - motion.inverse(points, line.step)
+        truth = moved @ beam_frame(np.deg2rad(line.angle_deg)).T / plan.voxel_mm
+        strain = np.diff(moved[:, 2]) / np.diff(height)
+        course.append((moved[-1, 2] - moved[0, 2]) / (height[-1] - height[0]))
+        errors.append([*(np.array(line.displacement_voxel) - truth).T, [*(np.array(line.strain) - strain), np.nan]])
+        deviations.append([*np.array(line.displacement_std).T, [*line.strain_std, np.nan]])
+    return np.array(errors), np.array(deviations), np.array(course)
+
+
+def _tell_errors(error: np.ndarray, deviation: np.ndarray) -> None:
+    share = error / deviation
+    for k, name in enumerate(("across the beam, voxel", "vertical, voxel", "along the beam, voxel", "strain")):
+        size, z = np.sqrt(np.nanmean(error[:, k] ** 2)), np.sqrt(np.nanmean(share[:, k] ** 2))
+        inside = np.nanmean(np.where(np.isnan(share[:, k]), np.nan, np.abs(share[:, k]) < 1.96))
+        print(f"{name}: error {size:.2g} rms, z {z:.2f}, 95 % intervals cover {100 * inside:.0f} %")
+
+
+def _draw(lines: list, course: np.ndarray, path: Path) -> None:
+    """Draw the mean strain of each step with its interval, the truth, and what is left of both."""
+    steps = [line for line in lines if isinstance(line, StepLine)]
+    step = np.array([line.step for line in steps])
+    strain = 100 * np.array([line.mean_strain for line in steps])
+    half = 196 * np.array([line.mean_strain_std for line in steps])
+    figure, (top, bottom) = new_figure(6.3, 2.6, 2)
+    for axes, middle in ((top, strain), (bottom, strain - 100 * course)):
+        axes.fill_between(step, middle - half, middle + half, color=BLUE, alpha=0.3, linewidth=0)
+        axes.plot(step, middle, color=BLUE, linewidth=1)
+        axes.set_xlabel("step")
+    top.plot(step, 100 * course, **TRUTH)
+    bottom.axhline(0, **TRUTH)
+    top.set_ylabel("mean strain (%)")
+    bottom.set_ylabel("less the true one (%)")
+    save(figure, path, dpi=150)
+
+
+if __name__ == "__main__":
+    main()
