@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 WINDOW = 40
 """Steps whose scales are found anew at each step."""
-LAG = 12
+LAG = 20
 """Steps that the filter goes over again."""
 FITTED = 64
 """Steps from which deviations are fitted, at most."""

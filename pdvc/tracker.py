@@ -36,7 +36,6 @@ from pdvc.pattern import GrowingPattern, Pattern
 from pdvc.preparation import Prepared, at_rest, radiograph_noise, stated_noise, with_radiographs
 from pdvc.process import FITTED_MODES
 from pdvc.progress import Progress, silent
-from pdvc.projection import BlockVectors
 from pdvc.residual_tests import residual_tests
 from pdvc.sensitivity_sums import adjoint
 from pdvc.setup import Setup
@@ -50,8 +49,8 @@ Image = NDArray[np.float32]
 
 DRAWS = 32
 """Draws of white noise that go along."""
-MERGED = 2
-"""Blocks of pixels down and across that are taken together."""
+MOST_BLOCKS = 300
+"""Blocks of pixels that are followed one by one; where there are more, neighbours are taken together."""
 MOST_CHANGES = 4
 """Changes of the motion at one scale, at most."""
 COARSE_CHANGE = 0.1
@@ -98,7 +97,7 @@ class Tracker:
         self._pool = ThreadPoolExecutor(numba.get_num_threads())
         space, few = _space(setup, solver, None), _space(setup, solver, FITTED_MODES)
         rows, columns = self._rest[1].systematic.shape
-        blocks = -(-rows // (MERGED * BAND_ROWS)) * -(-columns // (MERGED * BLOCK_COLUMNS))
+        blocks = len(_larger_blocks(-(-rows // BAND_ROWS), -(-columns // BLOCK_COLUMNS)).T)
         self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS + blocks)
 
     def take(self, radiograph: Arrival) -> Taken:
@@ -224,12 +223,16 @@ class Tracker:
         believed = np.zeros(unknowns) if left is None else BELIEF * adjoint(weighted, left, unknowns)
         data, white = seen(equations, covariance[None], amplitude.reshape(1, -1))
         draws = np.random.default_rng((0, step)).standard_normal((unknowns, DRAWS))
-        blocks = _merged(by_block(equations.blocks, white, np.ones((1, 1)))[0], equations.blocks[0])
+        each = by_block(equations.blocks, white, np.ones((1, 1)))[0]
+        blocks = each @ _larger_blocks(*equations.blocks[0].values.shape[:2])
         errors = np.column_stack([white[0] @ believed, draws, blocks]).astype(np.float32)
         return meets, Told(design=data.design[0], data=data.data[0], errors=errors)
 
     def _in_common(self, moved: Floats) -> Floats:
-        """Return the covariance (unknown, unknown) of what steps have in common: `moved` by errors (unknown, error)."""
+        """Return the covariance (unknown, unknown) of what steps have in common, from what errors do to amplitudes.
+
+        `moved` (unknown, error).
+        """
         believed, draws, blocks = np.split(moved, [1, 1 + DRAWS], axis=1)
         noise = draws @ draws.T / DRAWS
         more = np.sqrt(excess(blocks**2, np.diag(noise), self._basis.shape))
@@ -237,13 +240,12 @@ class Tracker:
         return np.asarray(believed @ believed.T + noise * (np.outer(larger, larger) - 1))
 
 
-def _merged(values: Floats, blocks: BlockVectors) -> Floats:
-    """Return sums (unknown, larger block) of what blocks tell (unknown, block): `MERGED` by `MERGED` of them."""
-    bands, columns, _ = blocks.values.shape
-    grid = values.reshape(-1, bands, columns)
-    for axis in (1, 2):
-        grid = np.add.reduceat(grid, np.arange(0, grid.shape[axis], MERGED), axis=axis)
-    return grid.reshape(len(values), -1)
+@cache
+def _larger_blocks(bands: int, columns: int) -> Floats:
+    """Return which of bands x columns blocks of pixels (block, larger block) are taken together: squares of them."""
+    side = int(np.ceil(np.sqrt(bands * columns / MOST_BLOCKS)))
+    down, across = (np.eye(-(-count // side)).repeat(side, axis=0)[:count] for count in (bands, columns))
+    return np.asarray(np.kron(down, across), dtype=np.float64)
 
 
 def _space(setup: Setup, solver: Smoother, most_modes: int | None) -> StateSpace:
