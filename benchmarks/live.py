@@ -9,6 +9,7 @@ is prepared is kept in the folder. The measurement of the whole test, at the end
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shutil
 import signal
@@ -23,7 +24,7 @@ import psutil
 from benchmarks.timing import machine
 from pdvc.deviations import beam_frame
 from pdvc.live import record_of
-from pdvc.record import LostLine, PlanLine, StepLine, read_record
+from pdvc.record import StepLine, read_record
 from simulator.scanner import simulate
 from simulator.scenario import course_of, load_scenario
 from validation.report.figures import BLUE, TRUTH, new_figure, save
@@ -75,7 +76,8 @@ def _followed(experiment: Path, arriving: Path, ready: Path, file: Path, pace_s:
     )
     rng, peak, wait_s, since = np.random.default_rng(0), 0.0, 0.0, time.monotonic()
     while not _whole(file):
-        time.sleep(0.05)
+        # not often: what is timed runs beside this
+        time.sleep(1)
         peak = max(peak, psutil.Process(follower.pid).memory_info().rss / 2**30)
         wait_s = wait_s or rng.uniform(5, 25)
         if kills and time.monotonic() > since + wait_s:
@@ -92,9 +94,9 @@ def _followed(experiment: Path, arriving: Path, ready: Path, file: Path, pace_s:
 
 def _whole(file: Path) -> bool:
     """Return whether each planned step has a line."""
-    lines = list(read_record(record_of(file)))
-    plan = [line for line in lines if isinstance(line, PlanLine)]
-    return bool(plan) and len({line.step for line in lines if isinstance(line, StepLine | LostLine)}) >= plan[0].steps
+    with record_of(file).open("rb") as record:
+        plan, lines = record.readline(), sum(1 for _ in record)
+    return bool(plan) and lines >= json.loads(plan)["steps"]
 
 
 def _tell(lines: list, arriving: Path, peak_gib: float) -> None:

@@ -27,7 +27,7 @@ from pdvc.deviations import beam_frame, strain_std, turned_std
 from pdvc.digest import digest
 from pdvc.experiment import Experiment, ExperimentError, Series
 from pdvc.incoming import Arrival, Incoming
-from pdvc.lagged import Late, Told
+from pdvc.lagged import FITTED, Late, Told
 from pdvc.lock import held
 from pdvc.measurement import Measurement
 from pdvc.options import DEFAULT, MeasureOptions
@@ -194,6 +194,7 @@ class _Follower:
         write_whole(self._told_file(step), _packed(vars(told)))
         state = {**self._tracker.kept(), "key": np.array(self._key), "line": np.array(line.text())}
         write_whole(self._folder / _STATE, _packed(state))
+        self._told_file(step - FITTED).unlink(missing_ok=True)
 
     def _go_on(self) -> None:
         """Know again what was known when the last line was written, or was about to be."""
