@@ -68,14 +68,16 @@ def _followed(experiment: Path, arriving: Path, ready: Path, file: Path, pace_s:
     arriving.mkdir(parents=True)
     live = [*BENCH, "live", experiment, "--radiographs", arriving, "--work", ready, "-o", file]
     follower = subprocess.Popen(live, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    # the test begins once everything is loaded
-    while not record_of(file).is_file():
+    # the test begins once everything is loaded, and the plan is written
+    while not (record_of(file).is_file() and record_of(file).stat().st_size):
+        if follower.poll() is not None:
+            raise RuntimeError(f"live: expected to follow, ended with exit code {follower.returncode}")
         time.sleep(0.1)
     player = subprocess.Popen(
         [*BENCH, "play", experiment, "--to", arriving, "--pace", str(pace_s)], stderr=subprocess.DEVNULL
     )
     rng, peak, wait_s, since = np.random.default_rng(0), 0.0, 0.0, time.monotonic()
-    while not _whole(file):
+    while not _whole(file) and follower.poll() is None:
         # not often: what is timed runs beside this
         time.sleep(1)
         peak = max(peak, psutil.Process(follower.pid).memory_info().rss / 2**30)

@@ -41,8 +41,8 @@ CHANGED = 0.1
 ROUNDS = 4
 """Times that the scales of a bend are found in turn with the bend."""
 
-
 _USED = "used_"
+"""Before the names of variances, where they are kept beside deviations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +114,7 @@ class LaggedFilter:
 
     def add(self, step: int, told: Told) -> None:
         """Take in what the radiograph of a step told; raises Late where it is more than `LAG` steps ago."""
+        # up to what was known before it
         self._after(step)
         self._told[step] = told
         self._passed = self._passed[: step - self._first + 1]
@@ -125,7 +126,7 @@ class LaggedFilter:
             given.misfit[step - window.start] = 1
             self._adopt(_with_scales(self._deviations, process.rescaled(given), window))
         self._after(self.steps)
-        self._passed = self._passed[max(self.steps - LAG - self._first, 0) :]
+        self._passed = self._passed[max(self.steps - 1 - LAG - self._first, 0) :]
         self._told = {t: each for t, each in self._told.items() if t >= self.steps - FITTED}
 
     def at(self, step: int) -> tuple[Floats, Floats]:
@@ -149,7 +150,7 @@ class LaggedFilter:
         self._adopt(replace(self._deviations, **shared))
 
     def kept(self) -> dict[str, NDArray[Any]]:
-        """Return all that it has to know to go on, but for what the last `FITTED` steps told."""
+        """Return all that it has to know to be restored, but for what steps told: `told` are those that it needs."""
         start = self._passed[0]
         return {
             **vars(self._deviations),
@@ -157,17 +158,20 @@ class LaggedFilter:
             "matrix": start.matrix,
             "vectors": start.vectors,
             "count": np.array([start.steps, self.steps, self._fitted]),
+            "told": np.array(sorted(self._told), dtype=np.int64),
         }
 
     def restore(self, kept: Mapping[str, NDArray[Any]], told: Mapping[int, Told]) -> None:
-        """Go on from what `kept` returned, and from what steps told, those of the last `FITTED` at least."""
+        """Know again what it knew when `kept` was asked, with what steps told since."""
         first, self.steps, self._fitted = kept["count"].tolist()
         self._deviations = Deviations(**{name: kept[name] for name in vars(self._deviations)})
-        self._told = {step: told[step] for step in sorted(told) if self.steps - FITTED <= step < self.steps}
+        self._told = {step: told[step] for step in kept["told"].tolist()}
         start = self._passed[0].copied()
         start.steps, start.matrix, start.vectors = first, kept["matrix"], kept["vectors"]
         self._passed = [start]
         self._variances = _Variances(**{name: kept[_USED + name] for name in vars(self._variances)})
+        # as far as it had gone: what is fitted next changes only what comes after
+        self._after(self.steps)
 
     @property
     def _first(self) -> int:
@@ -177,7 +181,7 @@ class LaggedFilter:
     def _after(self, step: int) -> Filter:
         """Return the filter before a step, after all those before it."""
         if step < self._first:
-            raise Late(f"step {step}: expected step {self._first} or a later one, the filter is past the others")
+            raise Late(f"step {step}: expected one that is at most {LAG} steps behind the newest")
         for t in range(self._passed[-1].steps, step):
             known = self._passed[-1].copied()
             known.add(*self._informed(t), self._variances.bend[t])

@@ -27,17 +27,18 @@ from pdvc.deviations import beam_frame, strain_std, turned_std
 from pdvc.digest import digest
 from pdvc.experiment import Experiment, ExperimentError, Series
 from pdvc.incoming import Arrival, Incoming
-from pdvc.lagged import FITTED, Late, Told
+from pdvc.lagged import Late, Told
 from pdvc.lock import held
 from pdvc.measurement import Measurement
 from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.progress import Progress, silent
 from pdvc.radiograph_table import TABLE
-from pdvc.record import LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
+from pdvc.record import Line, LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
 from pdvc.resumable import measure_into
 from pdvc.setup import Setup, set_up
 from pdvc.store import experiment_digest
 from pdvc.tracker import Taken, Tracker
+from pdvc.verdict import listed
 from pdvc.whole import write_whole
 
 Floats = NDArray[np.float64]
@@ -67,35 +68,49 @@ def follow(
     *,
     work: Path | None = None,
     progress: Progress = silent,
-    tell: Callable[[StepLine | LostLine], None] = lambda _: None,
+    tell: Callable[[Line], None] = lambda _: None,
     idle_s: float = float("inf"),
 ) -> Measurement:
-    """Follow the radiographs that come into a folder, until all that are planned are in, or none for `idle_s`.
+    """Follow the radiographs that come into a folder, until all that are planned are in, or no more for `idle_s`.
 
     Adds to `record_of(file)`, then measures the whole test into `file`, and returns the measurement. `tell` is called
     with each line that is added. `work` as in `measure_into`, with what `make_ready` has kept there. Interrupted, it
     goes on where it was.
     Raises ExperimentError where the folder cannot be followed, ValueError where the test cannot be measured or the
-    record belongs to another one, InUseError where another process is at the same file.
+    record belongs to another one or is complete, InUseError where another process is at the same file.
     """
     folder, kept = work or file.with_name(file.name + ".work"), file.with_name(file.name + ".live")
     with held(folder), held(kept), closing(Record(record_of(file))) as record:
+        _check_unfinished(record)
         compile_kernels(progress=progress)
         setup = set_up(experiment, options, work=folder, progress=progress)
-        follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept)
-        heard = time.monotonic()
-        while follower.missing and time.monotonic() < heard + idle_s:
-            if follower.look(tell):
+        follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept, tell)
+        heard = time.monotonic() if follower.begun else float("inf")
+        while follower.waits and time.monotonic() < heard + idle_s:
+            if follower.look():
                 heard = time.monotonic()
             else:
                 time.sleep(POLL_S)
+        recorded = follower.recorded()
+        # volumes of all scales and e of all views are not needed any more
+        del follower
         started = time.perf_counter()
-        measurement = measure_into(file, follower.recorded(), options, work=folder, progress=progress)
-        record.add(MeasurementLine(file=file.name, seconds=time.perf_counter() - started))
-    shutil.rmtree(kept, ignore_errors=True)
-    if work is None:
-        shutil.rmtree(folder, ignore_errors=True)
+        measurement = measure_into(file, recorded, options, work=folder, progress=progress)
+        last = MeasurementLine(file=file.name, seconds=time.perf_counter() - started)
+        record.add(last)
+        tell(last)
+        shutil.rmtree(kept, ignore_errors=True)
+        if work is None:
+            shutil.rmtree(folder, ignore_errors=True)
     return measurement
+
+
+def _check_unfinished(record: Record) -> None:
+    """Raise ValueError where a record is complete."""
+    if any(isinstance(line, MeasurementLine) for line in read_record(record.path)):
+        raise ValueError(
+            f"{record.path}: expected a test to be followed, found it followed to its end: choose another file"
+        )
 
 
 def record_of(file: Path) -> Path:
@@ -106,52 +121,70 @@ def record_of(file: Path) -> Path:
 class _Follower:
     """A test that is followed: what has come in, what the tracker knows, and the record."""
 
-    def __init__(self, setup: Setup, tracker: Tracker, radiographs: Path, record: Record, folder: Path) -> None:
-        """Begin, or go on where the record ends; raises ValueError where it belongs to another test."""
-        self._setup, self._tracker, self._radiographs, self._folder = setup, tracker, radiographs, folder
-        self._key = digest("live", experiment_digest(setup.experiment), setup.options)
-        self._record = record
-        first = PlanLine(
+    def __init__(
+        self,
+        setup: Setup,
+        tracker: Tracker,
+        radiographs: Path,
+        record: Record,
+        folder: Path,
+        tell: Callable[[Line], None],
+    ) -> None:
+        """Begin, or resume where the record ends; raises ValueError where it belongs to another test."""
+        self._setup, self._tracker, self._radiographs = setup, tracker, radiographs
+        self._record, self._folder, self._tell = record, folder, tell
+        self._key = digest("live", experiment_digest(setup.experiment), setup.options, str(radiographs.resolve()))
+        plan = PlanLine(
             title=setup.experiment.title,
             steps=len(setup.experiment.test),
             height_mm=tuple(setup.sections.height_mm.tolist()),
             voxel_mm=setup.geometry.voxel_mm,
         )
-        if self._record.lines:
-            self._go_on()
+        if record.lines:
+            self._resume(plan)
         else:
-            self._record.add(first)
+            for old in (self._folder / _STATE, *self._folder.glob(f"*{_TOLD}")):
+                old.unlink(missing_ok=True)
+            self._add(plan)
         lines = list(read_record(record.path))
         self._done = {line.step for line in lines if isinstance(line, StepLine)}
-        self._lost = {line for line in lines if isinstance(line, LostLine)}
+        self._lost = {_which(line) for line in lines if isinstance(line, LostLine)}
         # what was lost is looked at again, and said once
         self._incoming = self._opened(self._done)
 
     @property
-    def missing(self) -> bool:
+    def begun(self) -> bool:
+        """Return whether any radiograph has come."""
+        return bool(self._done)
+
+    @property
+    def waits(self) -> bool:
         """Return whether planned radiographs have neither come nor been given up."""
         return any(step not in self._done for step in range(len(self._setup.experiment.test)))
 
-    def look(self, tell: Callable[[StepLine | LostLine], None]) -> bool:
+    def look(self) -> bool:
         """Take in what has come; return whether anything has."""
         arrived, given_up = self._incoming.look()
         for unreadable in given_up:
-            self._say_lost(LostLine(step=unreadable.step, file=unreadable.file, reason=unreadable.reason), tell)
+            self._say_lost(unreadable.step, unreadable.file, unreadable.reason)
             # a right line may follow a wrong one of the table
             if unreadable.file != TABLE:
                 self._done.add(unreadable.step)
         for arrival in arrived:
-            self._take(arrival, tell)
+            self._take(arrival)
         return bool(arrived or given_up)
 
     def recorded(self) -> Experiment:
         """Return the experiment with all radiographs that have come, in the order of steps.
 
-        Raises ExperimentError where none has.
+        Raises ExperimentError where none has, or one that was followed cannot be read any more.
         """
         arrived, _ = self._opened(()).look()
-        if not arrived:
-            raise ExperimentError(f"{self._radiographs}: expected radiographs of the test, found none")
+        followed = {line.step for line in read_record(self._record.path) if isinstance(line, StepLine)}
+        gone = sorted(followed - {each.step for each in arrived})
+        if gone or not arrived:
+            found = f"that of step {listed(gone)} not any more" if gone else "none"
+            raise ExperimentError(f"{self._radiographs}: expected the radiographs of the test, found {found}")
         test = Series(
             counts=np.stack([each.counts for each in arrived]),
             angle_rad=np.array([each.angle_rad for each in arrived]),
@@ -165,65 +198,85 @@ class _Follower:
         size, steps = (geometry.rows, geometry.columns), len(self._setup.experiment.test)
         return Incoming(self._radiographs, size, steps, done=done)
 
-    def _take(self, arrival: Arrival, tell: Callable[[StepLine | LostLine], None]) -> None:
+    def _take(self, arrival: Arrival) -> None:
         started = time.perf_counter()
+        self._done.add(arrival.step)
         try:
             taken = self._tracker.take(arrival)
         except Late as error:
-            reason = f"{error}; it takes part in the measurement of the whole test"
-            self._say_lost(LostLine(step=arrival.step, file=arrival.file, reason=reason), tell)
-            self._done.add(arrival.step)
+            self._say_lost(arrival.step, arrival.file, f"{error}: only the measurement of the whole test has it")
+            return
+        except ValueError as error:
+            # a radiograph that shows another thing than the sample is no reason to stop
+            self._say_lost(arrival.step, arrival.file, f"step {arrival.step}: {error}")
+            self._recall()
             return
         line = _line(self._setup, arrival, taken, time.perf_counter() - started)
         self._keep(arrival.step, taken.told, line)
-        self._record.add(line)
-        self._done.add(arrival.step)
-        tell(line)
+        self._add(line)
         # after the motion is told, and not when there is time: what comes out must not depend on the clock
         self._tracker.settle()
 
-    def _say_lost(self, line: LostLine, tell: Callable[[StepLine | LostLine], None]) -> None:
-        """Say that a radiograph cannot be used; once, however often the test is gone on with."""
-        if line not in self._lost:
-            self._record.add(line)
-            self._lost.add(line)
-            tell(line)
+    def _add(self, line: Line) -> None:
+        self._record.add(line)
+        self._tell(line)
+
+    def _say_lost(self, step: int, file: str, reason: str) -> None:
+        """Say that a radiograph cannot be used: once, however often the test is resumed."""
+        line = LostLine(step=step, file=file, reason=reason)
+        if _which(line) not in self._lost:
+            self._lost.add(_which(line))
+            self._add(line)
 
     def _keep(self, step: int, told: Told, line: StepLine) -> None:
-        """Keep what is needed to go on after this step, whole or not at all."""
+        """Keep what is needed to resume after this step; the state tells of which steps it needs what they told."""
         write_whole(self._told_file(step), _packed(vars(told)))
-        state = {**self._tracker.kept(), "key": np.array(self._key), "line": np.array(line.text())}
-        write_whole(self._folder / _STATE, _packed(state))
-        self._told_file(step - FITTED).unlink(missing_ok=True)
+        state = self._tracker.kept()
+        write_whole(
+            self._folder / _STATE, _packed({**state, "key": np.array(self._key), "line": np.array(line.text())})
+        )
+        needed = {self._told_file(t) for t in state["told"].tolist()}
+        for old in set(self._folder.glob(f"*{_TOLD}")) - needed:
+            old.unlink(missing_ok=True)
 
-    def _go_on(self) -> None:
+    def _resume(self, plan: PlanLine) -> None:
         """Know again what was known when the last line was written, or was about to be."""
+        steps = [line.text() for line in read_record(self._record.path) if isinstance(line, StepLine)]
         path = self._folder / _STATE
+        if self._record.lines[0] != plan.text() or (steps and not path.is_file()):
+            raise ValueError(
+                f"{self._record.path}: expected the record of this test, found that of another one, or of other "
+                "options: choose another file"
+            )
         if not path.is_file():
-            # killed before the first radiograph was in, unless there are lines of some
-            if len(self._record.lines) > 1:
-                raise ValueError(
-                    f"{path}: expected what is needed to go on with the record, found none: choose another file"
-                )
             return
         state = _unpacked(path)
-        if str(state["key"]) != self._key:
-            raise ValueError(
-                f"{path}: expected the same reference scan, plan and options as now, found others: choose another "
-                "file for the measurement"
-            )
         line = str(state["line"])
-        if line not in self._record.lines[-2:]:
+        if str(state["key"]) != self._key or (line in steps and line != steps[-1]):
+            raise ValueError(
+                f"{path}: expected the same reference scan, plan, options, folder and software as now, and as much as "
+                "the record tells, found others: choose another file"
+            )
+        if line not in steps:
             self._record.add_text(line)
-        told = {
-            int(file.name.removesuffix(_TOLD)): Told(**_unpacked(file))
-            for file in sorted(self._folder.glob(f"*{_TOLD}"))
-        }
-        self._tracker.restore(state, told)
-        self._tracker.settle()
+        self._recall()
+
+    def _recall(self) -> None:
+        """Let the tracker know what was kept last."""
+        path = self._folder / _STATE
+        if path.is_file():
+            state = _unpacked(path)
+            told = {t: Told(**_unpacked(self._told_file(t))) for t in state["told"].tolist()}
+            self._tracker.restore(state, told)
+            self._tracker.settle()
 
     def _told_file(self, step: int) -> Path:
         return self._folder / f"{step:05d}{_TOLD}"
+
+
+def _which(line: LostLine) -> tuple[int, str, str]:
+    """Return what tells a lost radiograph, or a wrong line of the table, from others."""
+    return line.step, line.file, line.reason if line.file == TABLE else ""
 
 
 _STATE, _TOLD = "state.npz", ".told.npz"

@@ -13,6 +13,7 @@ whatever happens to the process, and anything may read it meanwhile. The first l
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -27,8 +28,12 @@ class Line:
     what: ClassVar[str]
 
     def text(self) -> str:
-        """Return the line, without its end."""
-        return json.dumps({"what": self.what, **asdict(self)})
+        """Return the line, without its end; what is not finite is null."""
+        return json.dumps(_plain({"what": self.what, **asdict(self)}), allow_nan=False)
+
+    def words(self) -> str:
+        """Return the line for a reader."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +48,10 @@ class PlanLine(Line):
     """Heights of the sections on the axis, mm."""
     voxel_mm: float
     """Voxel in which displacements are counted, mm."""
+
+    def words(self) -> str:
+        """Return the line for a reader."""
+        return f"following {self.title or 'a test'}: {self.steps} steps, {len(self.height_mm)} sections"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +77,7 @@ class StepLine(Line):
     """Mean square of the residual over its expected variance: one if the motion explains the radiograph."""
     passes: int
     seconds: float
-    """From when the radiograph was found whole to when its motion was known."""
+    """From when the radiograph was taken up to when its motion was known."""
     unix_s: float
     """When that was, by the clock of the machine, s since 1970."""
 
@@ -103,6 +112,10 @@ class MeasurementLine(Line):
     what: ClassVar[str] = "measurement"
     file: str
     seconds: float
+
+    def words(self) -> str:
+        """Return the line for a reader."""
+        return f"measured the whole test in {self.seconds:.0f} s"
 
 
 _KINDS: dict[str, type[Line]] = {each.what: each for each in (PlanLine, StepLine, LostLine, MeasurementLine)}
@@ -152,5 +165,17 @@ def read_record(path: Path) -> Iterator[Line]:
             ) from None
 
 
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def _tuples(value: Any) -> Any:
-    return tuple(_tuples(each) for each in value) if isinstance(value, list) else value
+    """Return the same as a line has it."""
+    if isinstance(value, list):
+        return tuple(_tuples(each) for each in value)
+    return math.nan if value is None else value

@@ -56,7 +56,7 @@ MOST_CHANGES = 4
 COARSE_CHANGE = 0.1
 """Rms change of the amplitudes, over the pixel of a coarse scale, under which the next scale begins."""
 NEAR = 2.0
-"""Rms residual at scale 2, over the radiograph's noise, under which the sample is not far from where it is sought."""
+"""Rms residual at the second finest scale, over the radiograph's noise, under which the sample is hardly far off."""
 LEAST_CHANGE = 0.2
 """The same at scale 1, over their standard deviations, under which a pass was the last one."""
 
@@ -112,11 +112,11 @@ class Tracker:
             self._known.fit()
 
     def kept(self) -> dict[str, NDArray[Any]]:
-        """Return all that has to be known to go on, but for what the last `FITTED` of `pdvc.lagged` steps told."""
+        """Return all that has to be known to be restored, but for what the steps `told` told."""
         return {**self._known.kept(), "pattern": self._pattern.sums, "pattern_steps": np.array(self._pattern.steps)}
 
     def restore(self, kept: Mapping[str, NDArray[Any]], told: Mapping[int, Told]) -> None:
-        """Go on from what `kept` returned, and from what steps told."""
+        """Know again what it knew when `kept` was asked, with what steps told since."""
         self._known.restore(kept, told)
         self._pattern.sums, self._pattern.steps = np.array(kept["pattern"]), int(kept["pattern_steps"])
 
@@ -182,12 +182,12 @@ class Tracker:
         scales = sorted(self._rest, reverse=True)
         second = scales[-2:][0]
         tried = [(pass_at(second, start), start) for start in starts]
-        equations, at = min(tried, key=lambda each: float(each[0].chi2[0]))
+        equations, start = min(tried, key=lambda each: float(each[0].chi2[0]))
         # coarser scales are for what is far off
-        near = equations.rms < NEAR * float(images(second).noise_rms or 1)
+        near, at = equations.rms < NEAR * float(images(second).noise_rms or 1), start
         for scale in scales[scales.index(second) if near else 0 :]:
             variance = float(images(scale).noise_rms or 1) ** 2
-            if not (near and scale == second):
+            if scale != second or at is not start:
                 equations = pass_at(scale, at)
             for _ in range(MOST_CHANGES):
                 matrix, vector = equations.matrix[0] / variance, equations.vector[0] / variance

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 from hypothesis import given
@@ -14,9 +15,18 @@ from tests.laws import law
 numbers = st.floats(-1e6, 1e6)
 rows = st.lists(st.tuples(numbers, numbers, numbers), max_size=3).map(tuple)
 several = st.lists(numbers, max_size=3).map(tuple)
+SINGLE = (
+    *("angle_deg", "time_s", "force_N", "mean_strain", "mean_strain_std"),
+    *("chi2_reduced", "seconds", "unix_s"),
+)
 lines = st.one_of(
     st.builds(PlanLine, title=st.text(), steps=st.integers(0), height_mm=several, voxel_mm=numbers),
-    st.builds(StepLine, displacement_voxel=rows, displacement_std=rows, strain=several, strain_std=several),
+    st.builds(
+        StepLine,
+        **{name: rows for name in ("displacement_voxel", "displacement_std")},
+        **{name: several for name in ("strain", "strain_std")},
+        **{name: numbers for name in SINGLE},
+    ),
     st.builds(LostLine, step=st.integers(-1), file=st.text(), reason=st.text()),
     st.builds(MeasurementLine, file=st.text(), seconds=numbers),
 )
@@ -47,6 +57,14 @@ def test_a_line_is_one_line_of_json_that_says_what_it_is():
     line = LostLine(step=3, file="a.tif", reason="cut\nshort")
     assert "\n" not in line.text()
     assert json.loads(line.text()) == {"what": "lost", "step": 3, "file": "a.tif", "reason": "cut\nshort"}
+
+
+def test_what_is_not_finite_is_null_which_every_reader_knows(tmp_path):
+    line = MeasurementLine(file="motion.nc", seconds=float("inf"))
+    assert json.loads(line.text(), parse_constant=pytest.fail)["seconds"] is None
+    (tmp_path / "record").write_text(line.text() + "\n", encoding="utf-8")
+    (found,) = read_record(tmp_path / "record")
+    assert math.isnan(found.seconds)
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"what": "weather"}', '{"what": "lost", "step": 1}'])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -57,7 +58,7 @@ def live(
     ] = None,
     idle: Annotated[
         float | None,
-        typer.Option("--idle", min=0.0, metavar="S", help="The test is over when nothing came for so many seconds."),
+        typer.Option("--idle", min=0.0, metavar="S", help="The test is over when no more came for so many seconds."),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the lines of the record on stdout, for another program.")
@@ -72,13 +73,18 @@ def live(
 
     Example:  `pdvc-bench live out/quick/experiment --radiographs out/arriving --work out/ready -o out/motion.nc`
     """
+    # as long as bars are drawn, what is printed goes to the terminal, above them
+    stdout = sys.stdout
     with answering(resume="give the same command again to go on from here") as progress:
         from pdvc.experiment import read_experiment
         from pdvc.live import follow, record_of
-        from pdvc.record import LostLine, StepLine
+        from pdvc.record import Line
 
-        def show(line: StepLine | LostLine) -> None:
-            print(line.text() if as_json else line.words(), flush=True)
+        def show(line: Line) -> None:
+            if as_json:
+                print(line.text(), file=stdout, flush=True)
+            else:
+                print(line.words(), flush=True)
 
         chosen, planned = read_options(options), read_experiment(experiment, planned=True)
         use_threads(threads)
