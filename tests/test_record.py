@@ -23,9 +23,9 @@ lines = st.one_of(
     st.builds(PlanLine, title=st.text(), steps=st.integers(0), height_mm=several, voxel_mm=numbers),
     st.builds(
         StepLine,
-        **{name: rows for name in ("displacement_voxel", "displacement_std")},
-        **{name: several for name in ("strain", "strain_std")},
-        **{name: numbers for name in SINGLE},
+        **dict.fromkeys(("displacement_voxel", "displacement_std"), rows),
+        **dict.fromkeys(("strain", "strain_std"), several),
+        **dict.fromkeys(SINGLE, numbers),
     ),
     st.builds(LostLine, step=st.integers(-1), file=st.text(), reason=st.text()),
     st.builds(MeasurementLine, file=st.text(), seconds=numbers),
