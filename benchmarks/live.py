@@ -2,9 +2,8 @@
 
 `play` and `live` run as a user runs them, each a process of its own. Latency is counted from when the TIFF of a
 radiograph was whole on the disk to when its motion was known; to write it down takes some hundredths of a second
-more.
-With `--kills N`, `live` is killed with SIGKILL N times, at moments drawn at random, and started again each time. What is
-prepared is kept in the folder. The measurement of the whole test, at the end, is left out.
+more. With `--kills N`, `live` is killed with SIGKILL N times, at moments drawn at random, and started again each
+time. What is prepared is kept in the folder. The measurement of the whole test, at the end, is left out.
 """
 
 from __future__ import annotations
