@@ -10,14 +10,12 @@ started again goes on with the radiograph that it had in hand, to the same numbe
 
 from __future__ import annotations
 
-import io
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,10 +34,9 @@ from pdvc.radiograph_table import TABLE
 from pdvc.record import Line, LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
 from pdvc.resumable import measure_into
 from pdvc.setup import Setup, set_up
-from pdvc.store import experiment_digest
+from pdvc.store import Arrays, experiment_digest, read_arrays, write_arrays
 from pdvc.tracker import Taken, Tracker
 from pdvc.verdict import listed
-from pdvc.whole import write_whole
 
 Floats = NDArray[np.float64]
 
@@ -209,7 +206,9 @@ class _Follower:
         except ValueError as error:
             # a radiograph that shows another thing than the sample is no reason to stop
             self._say_lost(arrival.step, arrival.file, f"step {arrival.step}: {error}")
-            self._recall()
+            state = read_arrays(self._folder / _STATE)
+            if state is not None:
+                self._recall(state)
             return
         line = _line(self._setup, arrival, taken, time.perf_counter() - started)
         self._keep(arrival.step, taken.told, line)
@@ -230,11 +229,9 @@ class _Follower:
 
     def _keep(self, step: int, told: Told, line: StepLine) -> None:
         """Keep what is needed to resume after this step; the state tells of which steps it needs what they told."""
-        write_whole(self._told_file(step), _packed(vars(told)))
+        write_arrays(self._told_file(step), vars(told))
         state = self._tracker.kept()
-        write_whole(
-            self._folder / _STATE, _packed({**state, "key": np.array(self._key), "line": np.array(line.text())})
-        )
+        write_arrays(self._folder / _STATE, {**state, "key": np.array(self._key), "line": np.array(line.text())})
         needed = {self._told_file(t) for t in state["told"].tolist()}
         for old in set(self._folder.glob(f"*{_TOLD}")) - needed:
             old.unlink(missing_ok=True)
@@ -243,14 +240,14 @@ class _Follower:
         """Know again what was known when the last line was written, or was about to be."""
         steps = [line.text() for line in read_record(self._record.path) if isinstance(line, StepLine)]
         path = self._folder / _STATE
-        if self._record.lines[0] != plan.text() or (steps and not path.is_file()):
+        state = read_arrays(path)
+        if self._record.lines[0] != plan.text() or (steps and state is None):
             raise ValueError(
                 f"{self._record.path}: expected the record of this test, found that of another one, or of other "
                 "options: choose another file"
             )
-        if not path.is_file():
+        if state is None:
             return
-        state = _unpacked(path)
         line = str(state["line"])
         if str(state["key"]) != self._key or (line in steps and line != steps[-1]):
             raise ValueError(
@@ -259,16 +256,20 @@ class _Follower:
             )
         if line not in steps:
             self._record.add_text(line)
-        self._recall()
+        self._recall(state)
 
-    def _recall(self) -> None:
-        """Let the tracker know what was kept last."""
-        path = self._folder / _STATE
-        if path.is_file():
-            state = _unpacked(path)
-            told = {t: Told(**_unpacked(self._told_file(t))) for t in state["told"].tolist()}
-            self._tracker.restore(state, told)
-            self._tracker.settle()
+    def _recall(self, state: Arrays) -> None:
+        """Let the tracker know what was kept; raises ValueError where what a step told is missing or damaged."""
+        told = {}
+        for step in state["told"].tolist():
+            found = read_arrays(self._told_file(step))
+            if found is None:
+                raise ValueError(
+                    f"{self._told_file(step)}: expected what step {step} told, whole: choose another file"
+                )
+            told[step] = Told(**found)
+        self._tracker.restore(state, told)
+        self._tracker.settle()
 
     def _told_file(self, step: int) -> Path:
         return self._folder / f"{step:05d}{_TOLD}"
@@ -279,7 +280,7 @@ def _which(line: LostLine) -> tuple[int, str, str]:
     return line.step, line.file, line.reason if line.file == TABLE else ""
 
 
-_STATE, _TOLD = "state.npz", ".told.npz"
+_STATE, _TOLD = "state.kept", ".told.kept"
 
 
 def _line(setup: Setup, arrival: Arrival, taken: Taken, seconds: float) -> StepLine:
@@ -310,14 +311,3 @@ def _line(setup: Setup, arrival: Arrival, taken: Taken, seconds: float) -> StepL
 
 def _rows(values: Floats) -> tuple[tuple[float, float, float], ...]:
     return tuple((float(a), float(b), float(c)) for a, b, c in values)
-
-
-def _packed(values: Mapping[str, NDArray[Any]]) -> memoryview:
-    content = io.BytesIO()
-    np.savez(content, allow_pickle=False, **values)
-    return content.getbuffer()
-
-
-def _unpacked(path: Path) -> dict[str, NDArray[Any]]:
-    with np.load(path) as kept:
-        return dict(kept)

@@ -49,19 +49,24 @@ class Store:
         if self._folder is None:
             return make()
         path = self._folder / f"{name}-{digest(name, *depends)}.kept"
-        found = _read(path)
+        found = read_arrays(path)
         if found is not None:
             return found
         values = make()
-        content = io.BytesIO()
-        np.savez(content, allow_pickle=False, **values)
-        sealed = hashlib.sha256(content.getbuffer()).digest() + content.getvalue()
-        # another process may keep the same at the same time: each writes its own file
-        write_whole(path, sealed, partial=path.with_suffix(f".{uuid.uuid4().hex}.partial"))
+        write_arrays(path, values)
         return values
 
 
-def _read(path: Path) -> Arrays | None:
+def write_arrays(path: Path, values: Arrays) -> None:
+    """Write arrays to a sealed file, whole or not at all."""
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, **values)
+    sealed = hashlib.sha256(content.getbuffer()).digest() + content.getvalue()
+    # another process may keep the same at the same time: each writes its own file
+    write_whole(path, sealed, partial=path.with_suffix(f".{uuid.uuid4().hex}.partial"))
+
+
+def read_arrays(path: Path) -> Arrays | None:
     """Return the arrays of a file; None where it is not there, cut short or damaged: then they are made again."""
     try:
         content = path.read_bytes()

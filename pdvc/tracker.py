@@ -45,7 +45,6 @@ from pdvc.state_space import StateSpace
 from pdvc.walk import BAND_ROWS, BLOCK_COLUMNS
 
 Floats = NDArray[np.float64]
-Image = NDArray[np.float32]
 
 DRAWS = 32
 """Draws of white noise that go along."""
@@ -70,8 +69,6 @@ class Taken:
     covariance: Floats
     """(section * motion, the same), voxel^2."""
     told: Told
-    residual: Image
-    """rho (row, column) over the window, grey levels, at the last pass."""
     tests: ResidualTests
     """Whether it is the noise that was expected."""
     passes: int
@@ -132,14 +129,12 @@ class Tracker:
         meets, told = self._told_by(fine, amplitude, equations, noise, radiograph.step)
         self._known.add(radiograph.step, told)
         found, covariance = self._known.at(radiograph.step)
-        residual = equations.residual[0]
         if pattern is not None:
-            self._pattern.add(residual, pattern.grey[fine.systematic.window], meets.image)
+            self._pattern.add(equations.residual[0], pattern.grey[fine.systematic.window], meets.image)
         return Taken(
             amplitude=found[:, 0].reshape(self._basis.shape),
             covariance=covariance + self._in_common(found[:, 1:]),
             told=told,
-            residual=residual,
             tests=tests.result(),
             passes=passes,
         )

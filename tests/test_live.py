@@ -135,17 +135,17 @@ def test_killed_anywhere_it_goes_on_to_the_same_numbers(
     folder, planned, ready, followed, tmp_path, monkeypatch, measured_never
 ):
     arriving, file, lines = played(folder, tmp_path / "arriving"), tmp_path / "motion.nc", []
-    writes, kept = 0, live.write_whole
+    writes, kept = 0, live.write_arrays
 
     def killed_at(write: int):
-        def write_whole(path, content):
+        def write_arrays(path, values):
             nonlocal writes
             writes += 1
             if writes == write:
                 raise Killed
-            kept(path, content)
+            kept(path, values)
 
-        return write_whole
+        return write_arrays
 
     def kill_after(line):
         lines.append(line)
@@ -156,7 +156,7 @@ def test_killed_anywhere_it_goes_on_to_the_same_numbers(
     # before what a radiograph told is kept, before what the tracker knows, and after its line
     for write, tell in ((7, lines.append), (2, lines.append), (0, kill_after)):
         writes = 0
-        monkeypatch.setattr(live, "write_whole", killed_at(write))
+        monkeypatch.setattr(live, "write_arrays", killed_at(write))
         with pytest.raises(Killed):
             follow(planned, arriving, file, work=ready, tell=tell)
     # and while a line was written, which is then half there
