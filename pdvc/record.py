@@ -6,6 +6,7 @@ whatever happens to the process, and anything may read it meanwhile. The first l
 
     {"what": "plan", "title": ..., "steps": 127, "height_mm": [...], "voxel_mm": 0.0107}
     {"what": "step", "step": 0, "angle_deg": ..., "time_s": ..., "displacement_voxel": [[...], ...], ...}
+    {"what": "alarm", "step": 61, "alarm": "crack", "value": 9.1, "limit": 6.0, "place_mm": [0.2, null, -0.4], "reason": "..."}
     {"what": "lost", "step": 4, "file": "00004.tif", "reason": "..."}
     {"what": "measurement", "file": "motion.nc", "seconds": 312.0}
 """
@@ -91,6 +92,27 @@ class StepLine(Line):
 
 
 @dataclass(frozen=True, kw_only=True)
+class AlarmLine(Line):
+    """An alarm that a radiograph raised."""
+
+    what: ClassVar[str] = "alarm"
+    step: int
+    alarm: str
+    """Its name, as `pdvc.alarms` explains it."""
+    value: float
+    """What was tested."""
+    limit: float
+    """What it was expected to be under, or over where it is under it."""
+    reason: str
+    place_mm: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    """Where on the sample, as it was at rest (x, y, z), as far as it is known."""
+
+    def words(self) -> str:
+        """Return the line for a reader."""
+        return f"ALARM {self.alarm}: step {self.step}: {self.reason}"
+
+
+@dataclass(frozen=True, kw_only=True)
 class LostLine(Line):
     """A radiograph that could not be used, and why."""
 
@@ -118,7 +140,9 @@ class MeasurementLine(Line):
         return f"measured the whole test in {self.seconds:.0f} s"
 
 
-_KINDS: dict[str, type[Line]] = {each.what: each for each in (PlanLine, StepLine, LostLine, MeasurementLine)}
+_KINDS: dict[str, type[Line]] = {
+    each.what: each for each in (PlanLine, StepLine, AlarmLine, LostLine, MeasurementLine)
+}
 
 
 class Record:
