@@ -66,13 +66,14 @@ def follow(
     work: Path | None = None,
     progress: Progress = silent,
     tell: Callable[[Line], None] = lambda _: None,
+    see: Callable[[Arrival, Taken], None] = lambda _arrival, _taken: None,
     idle_s: float = float("inf"),
 ) -> Measurement:
     """Follow the radiographs that come into a folder, until all that are planned are in, or no more for `idle_s`.
 
     Adds to `record_of(file)`, then measures the whole test into `file`, and returns the measurement. `tell` is called
-    with each line that is added. `work` as in `measure_into`, with what `make_ready` has kept there. Interrupted, it
-    goes on where it was.
+    with each line that is added, `see` with each radiograph after its line was. `work` as in `measure_into`, with what
+    `make_ready` has kept there. Interrupted, it goes on where it was.
     Raises ExperimentError where the folder cannot be followed, ValueError where the test cannot be measured or the
     record belongs to another one or is complete, InUseError where another process is at the same file.
     """
@@ -81,7 +82,7 @@ def follow(
         _check_unfinished(record)
         compile_kernels(progress=progress)
         setup = set_up(experiment, options, work=folder, progress=progress)
-        follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept, tell)
+        follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept, tell, see)
         heard = time.monotonic() if follower.begun else float("inf")
         while follower.waits and time.monotonic() < heard + idle_s:
             if follower.look():
@@ -126,10 +127,11 @@ class _Follower:
         record: Record,
         folder: Path,
         tell: Callable[[Line], None],
+        see: Callable[[Arrival, Taken], None],
     ) -> None:
         """Begin, or resume where the record ends; raises ValueError where it belongs to another test."""
         self._setup, self._tracker, self._radiographs = setup, tracker, radiographs
-        self._record, self._folder, self._tell = record, folder, tell
+        self._record, self._folder, self._tell, self._see = record, folder, tell, see
         self._key = digest("live", experiment_digest(setup.experiment), setup.options, str(radiographs.resolve()))
         plan = PlanLine(
             title=setup.experiment.title,
@@ -213,6 +215,7 @@ class _Follower:
         line = _line(self._setup, arrival, taken, time.perf_counter() - started)
         self._keep(arrival.step, taken.told, line)
         self._add(line)
+        self._see(arrival, taken)
         # after the motion is told, and not when there is time: what comes out must not depend on the clock
         self._tracker.settle()
 

@@ -6,7 +6,7 @@ whatever happens to the process, and anything may read it meanwhile. The first l
 
     {"what": "plan", "title": ..., "steps": 127, "height_mm": [...], "voxel_mm": 0.0107}
     {"what": "step", "step": 0, "angle_deg": ..., "time_s": ..., "displacement_voxel": [[...], ...], ...}
-    {"what": "alarm", "step": 61, "alarm": "crack", "value": 9.1, "limit": 6.0, "place_mm": [0.2, null, -0.4], "reason": "..."}
+    {"what": "alarm", "step": 61, "alarm": "crack", "value": 9.1, "limit": 6.0, "place_mm": [0.2, null, 1.4], ...}
     {"what": "lost", "step": 4, "file": "00004.tif", "reason": "..."}
     {"what": "measurement", "file": "motion.nc", "seconds": 312.0}
 """

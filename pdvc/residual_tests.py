@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import reduce
@@ -29,10 +30,12 @@ def residual_tests(
     noise: Noise,
     residual: Image,
     unknowns: int,
+    see: Callable[[int, Image], None] = lambda _step, _white: None,
 ) -> ResidualTests:
     """Return whether the residual (step, row, column), grey levels, of a solution is the noise that is expected.
 
-    At amplitudes (step, section, motion), voxels; `unknowns` of all steps were found.
+    At amplitudes (step, section, motion), voxels; `unknowns` of all steps were found. `see` is shown the residual of
+    each step over its standard deviation, zero where it is not used.
     """
     overlap = noise_overlap(noise.smooth_px)
     sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
@@ -40,7 +43,9 @@ def residual_tests(
     def of_step(t: int) -> _Sums:
         places = systematic.places(t, images.rays[t], basis, amplitude[t], images.voxel_mm)
         used, view = images.weight[t % len(images.weight)] > 0, mean_of_views(noise, sight.of_step(t))
-        return _sums(overlap, residual[t], used, noise.step(t), view, noise.flat, places, systematic.corner)
+        white, sums = _sums(overlap, residual[t], used, noise.step(t), view, noise.flat, places, systematic.corner)
+        see(t, white)
+        return sums
 
     # a step is one thread's work; sums are added in order, whichever is ready first
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
@@ -93,8 +98,10 @@ def _sums(
     flat: Image,
     places: Floats,
     corner: tuple[int, int],
-) -> _Sums:
-    """Return the sums of a step: its radiograph's noise over the window, its views' and the flats' over the detector.
+) -> tuple[Image, _Sums]:
+    """Return the residual of a step over its standard deviation, and its sums.
+
+    Its radiograph's noise is given over the window, its views' and the flats' over the detector.
 
     Noise varies little from pixel to pixel, so that it is taken from the pixel above and left of a place.
     """
@@ -135,7 +142,8 @@ def _sums(
         expected[axis] = float((shared[axis] / variance)[tuple(first)][both].sum())
         pairs[axis] = int(both.sum())
 
-    return _Sums(chi2=float((white**2).sum()), pixels=int(used.sum()), seen=seen, expected=expected, pairs=pairs)
+    total = _Sums(chi2=float((white**2).sum()), pixels=int(used.sum()), seen=seen, expected=expected, pairs=pairs)
+    return white.astype(np.float32), total
 
 
 def _lagged(overlap: Floats, tap: Floats, lag: int) -> Floats:

@@ -45,6 +45,7 @@ from pdvc.state_space import StateSpace
 from pdvc.walk import BAND_ROWS, BLOCK_COLUMNS
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
 
 DRAWS = 32
 """Draws of white noise that go along."""
@@ -69,6 +70,8 @@ class Taken:
     covariance: Floats
     """(section * motion, the same), voxel^2."""
     told: Told
+    residual: Image
+    """Over its standard deviation (row, column), of the used window; zero where it is not used."""
     tests: ResidualTests
     """Whether it is the noise that was expected."""
     passes: int
@@ -122,9 +125,11 @@ class Tracker:
         images = self._images(radiograph, pattern)
         fine, noise = images(1), self._noise_of(radiograph, pattern)
         amplitude, equations, passes = self._approached(images, radiograph.step)
+        white = np.zeros_like(equations.residual)
         tests = self._pool.submit(
             residual_tests,
             *(fine.images, fine.systematic, self._basis, amplitude, noise, equations.residual, amplitude.size),
+            see=white.__setitem__,
         )
         meets, told = self._told_by(fine, amplitude, equations, noise, radiograph.step)
         self._known.add(radiograph.step, told)
@@ -136,6 +141,7 @@ class Tracker:
             covariance=covariance + self._in_common(found[:, 1:]),
             told=told,
             tests=tests.result(),
+            residual=white[0],
             passes=passes,
         )
 
