@@ -15,6 +15,7 @@ whose scale s in Q = s Q_1 is found in turn with w, so that a slip is followed i
 from __future__ import annotations
 
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -36,13 +37,15 @@ FITTED = 64
 """Steps from which deviations are fitted, at most."""
 EVERY = 16
 """Steps after which deviations are fitted anew."""
+MEANWHILE = 2
+"""Steps that go on while deviations are fitted, which takes as long as some of them."""
 CHANGED = 0.1
 """Change of a step's scales, of their logarithm, from which on the filter goes over it again."""
 ROUNDS = 4
 """Times that the scales of a bend are found in turn with the bend."""
 
-_USED = "used_"
-"""Before the names of variances, where they are kept beside deviations."""
+_USED, _GIVEN = "used_", "given_"
+"""Before the names of variances, and of deviations that are being fitted, where they are kept beside deviations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +58,19 @@ class Told:
     """y (unknown,)."""
     errors: NDArray[np.float32] | Floats
     """(unknown, error)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fit:
+    """Deviations that are being fitted."""
+
+    window: slice
+    """The steps that tell them."""
+    about: Floats
+    """Amplitudes (unknown,) about which those of the first step may be."""
+    given: Deviations
+    """Those from which the search starts, of these steps."""
+    found: Future[Deviations]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +102,8 @@ class LaggedFilter:
         self._deviations = space.first_guess() if bend_voxel == "fit" else space.fixed(bend_voxel)
         self._told: dict[int, Told] = {}
         self._fitted = 0
+        self._fit: _Fit | None = None
+        self._thread = ThreadPoolExecutor(1)
         self.steps = 0
         """Steps so far: up to the newest one that told something."""
         self._passed = [Filter(space, space.end_variance(self._deviations), errors)]
@@ -119,15 +137,21 @@ class LaggedFilter:
         self._told[step] = told
         self._passed = self._passed[: step - self._first + 1]
         self.steps = max(self.steps, step + 1)
+        if self._fit is not None and self.steps >= self._fitted + MEANWHILE:
+            found = self._fit.found.result()
+            # the ends of a window are not those of the test
+            shared = {name: getattr(found, name) for name in ("bend_voxel", "roughness", "apparent_voxel")}
+            self._adopt(replace(self._deviations, **shared))
+            self._fit = None
         if self._finds:
             window = slice(max(self.steps - WINDOW, 0), self.steps)
-            process, given = self._process(window)
+            process, given = self._process(window, self._about()), self._given(window)
             # nothing was known of a step before its radiograph
             given.misfit[step - window.start] = 1
             self._adopt(_with_scales(self._deviations, process.rescaled(given), window))
         self._after(self.steps)
         self._passed = self._passed[max(self.steps - 1 - LAG - self._first, 0) :]
-        self._told = {t: each for t, each in self._told.items() if t >= self.steps - FITTED}
+        self._told = {t: each for t, each in self._told.items() if t >= self.steps - FITTED - MEANWHILE}
 
     def at(self, step: int) -> tuple[Floats, Floats]:
         """Return a step's amplitudes and what errors in common do to them (unknown, 1 + error), and their covariance.
@@ -139,20 +163,34 @@ class LaggedFilter:
         return to @ mean, to @ covariance @ to.T
 
     def fit(self) -> None:
-        """Fit the deviations where it is time to. It takes as long as some steps."""
-        if not self._finds or self.steps < self._fitted + EVERY:
-            return
-        self._fitted = self.steps
-        process, given = self._process(slice(max(self.steps - FITTED, 0), self.steps))
-        found = process.fitted(given, 1)
-        # the ends of a window are not those of the test
-        shared = {name: getattr(found, name) for name in ("bend_voxel", "roughness", "apparent_voxel")}
-        self._adopt(replace(self._deviations, **shared))
+        """Begin to fit the deviations where it is time to, beside what comes next.
+
+        They are taken over `MEANWHILE` steps later, when they are ready or waited for: what comes out does not depend
+        on the clock.
+        """
+        if self._finds and self._fit is None and self.steps >= self._fitted + EVERY:
+            self._fitted = self.steps
+            window = slice(max(self.steps - FITTED, 0), self.steps)
+            self._fit = self._begun(window, self._about(), self._given(window))
+
+    def _begun(self, window: slice, about: Floats, given: Deviations) -> _Fit:
+        found = self._thread.submit(self._process(window, about).fitted, given, 1)
+        return _Fit(window=window, about=about, given=given, found=found)
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that it has to know to be restored, but for what steps told: `told` are those that it needs."""
-        start = self._passed[0]
+        start, fit = self._passed[0], self._fit
+        fitting = (
+            {}
+            if fit is None
+            else {
+                **{_GIVEN + name: values for name, values in vars(fit.given).items()},
+                "window": np.array([fit.window.start, fit.window.stop]),
+                "about": fit.about,
+            }
+        )
         return {
+            **fitting,
             **vars(self._deviations),
             **{_USED + name: values for name, values in vars(self._variances).items()},
             "matrix": start.matrix,
@@ -172,6 +210,10 @@ class LaggedFilter:
         self._variances = _Variances(**{name: kept[_USED + name] for name in vars(self._variances)})
         # as far as it had gone: what is fitted next changes only what comes after
         self._after(self.steps)
+        self._fit = None
+        if "window" in kept:
+            given = Deviations(**{name: kept[_GIVEN + name] for name in vars(self._deviations)})
+            self._fit = self._begun(slice(*kept["window"].tolist()), kept["about"], given)
 
     @property
     def _first(self) -> int:
@@ -231,21 +273,27 @@ class LaggedFilter:
                 deviations = replace(deviations, **bend_scales(space, squares / once))
         return np.asarray(space.bend_variance(deviations)[0] / factor**2)
 
-    def _process(self, window: slice) -> tuple[Process, Deviations]:
-        """Return the process of some steps, in few modes, about where its first step may be; and its deviations."""
+    def _about(self) -> Floats:
+        """Return amplitudes (unknown,) about which those of the first step of a window may be."""
+        if not self._first:
+            return np.zeros(len(self.space.to_amplitude))
+        return np.asarray(self.space.to_amplitude @ self._passed[0].now()[0][:, 0])
+
+    def _given(self, window: slice) -> Deviations:
+        """Return the deviations of some steps, of which the first may be anywhere."""
+        given = _within(self._deviations, window)
+        return replace(given, end_voxel=np.full_like(given.end_voxel, self.space.prior_voxel))
+
+    def _process(self, window: slice, about: Floats) -> Process:
+        """Return the process of some steps, in few modes, about where its first step may be."""
         space = self._few.within(window)
         steps, unknowns = space.shape[0], len(space.to_amplitude)
         design, data = np.zeros((steps, unknowns, unknowns)), np.zeros((steps, unknowns))
-        about = np.zeros(unknowns)
-        if self._first:
-            about = self.space.to_amplitude @ self._passed[0].now()[0][:, 0]
         for step, told in self._told.items():
             if window.start <= step < window.stop:
                 design[step - window.start] = told.design
                 data[step - window.start] = told.data - told.design @ about
-        given = _within(self._deviations, window)
-        wide = np.full_like(given.end_voxel, space.prior_voxel)
-        return Process(space, Seen(design=design, data=data)), replace(given, end_voxel=wide)
+        return Process(space, Seen(design=design, data=data))
 
 
 @dataclass(frozen=True, kw_only=True)

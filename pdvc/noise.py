@@ -223,18 +223,25 @@ class StepNoise:
         shared = overlaid(both, noise.flat.shape)
         return cls(image=image, view=view, weighted=weighted, moved=moved, shared=shared)
 
-    def own(self, flat: Image, unknowns: int, pool: Executor | None = None) -> dict[str, Floats]:
-        """Return V of the step alone, by `SOURCES`, for a variance of the mean flat (row, column).
+    def own(
+        self, flat: Image, unknowns: int, sources: Sequence[str] = SOURCES, pool: Executor | None = None
+    ) -> dict[str, Floats]:
+        """Return V of the step alone, by some of `SOURCES`, for a variance of the mean flat (row, column).
 
         With a pool, sources side by side.
         """
-        met = (self.weighted, self.image.variance), (self.moved, self.view.variance), (self.shared, flat)
+        met = {
+            "radiographs": (self.weighted, self.image.variance),
+            "views": (self.moved, self.view.variance),
+            "flats": (self.shared, flat),
+        }
 
-        def of_source(each: tuple[Sensitivities, Image]) -> Floats:
-            return product(each[0], each[0], each[1], unknowns)
+        def of_source(source: str) -> Floats:
+            field, variance = met[source]
+            return product(field, field, variance, unknowns)
 
-        found = map(of_source, met) if pool is None else pool.map(of_source, met)
-        return dict(zip(SOURCES, found, strict=True))
+        found = map(of_source, sources) if pool is None else pool.map(of_source, sources)
+        return dict(zip(sources, found, strict=True))
 
 
 def meeting_noise(volume: Volume, smooth_px: float) -> Volume:

@@ -10,6 +10,9 @@ model of the image. Whatever they are, they stay in their place on the sample or
 pixels err independently of each other (`pdvc.coherent`). What each block told, L^-1 c_b, goes through the filter
 beside the data, as draws of white noise do. By how much more the blocks move the amplitudes of a motion than noise
 does, its intervals are widened. e, believed to a share, errs alike in all blocks: it goes along by itself.
+
+What the noise of views and flats does to a radiograph can be told before it comes, where the sample is expected and
+from the reference view that looks along its direction: V changes little over a voxel.
 """
 
 from __future__ import annotations
@@ -31,13 +34,22 @@ from pdvc.experiment import Series
 from pdvc.incoming import Arrival
 from pdvc.lagged import LaggedFilter, Told
 from pdvc.measurement import ResidualTests
-from pdvc.noise import BELIEF, Noise, StepNoise, meeting_noise, registered_left, weighted_sensitivities
+from pdvc.noise import (
+    BELIEF,
+    ImageNoise,
+    Noise,
+    StepNoise,
+    meeting_noise,
+    registered_left,
+    weighted_sensitivities,
+)
 from pdvc.pattern import GrowingPattern, Pattern
 from pdvc.preparation import Prepared, at_rest, radiograph_noise, stated_noise, with_radiographs
 from pdvc.process import FITTED_MODES
 from pdvc.progress import Progress, silent
+from pdvc.projection import Sensitivities
 from pdvc.residual_tests import residual_tests
-from pdvc.sensitivity_sums import adjoint
+from pdvc.sensitivity_sums import adjoint, product
 from pdvc.setup import Setup
 from pdvc.smoother import WORSE, Smoother, seen
 from pdvc.solution import SHORTER
@@ -49,6 +61,10 @@ Image = NDArray[np.float32]
 
 DRAWS = 32
 """Draws of white noise that go along."""
+AWAITED_VOXEL = 1.0
+"""Rms distance of the motion from the expected one, up to which V is that of the expected one."""
+AWAITED_RAD = 2e-3
+"""Difference of the angle from the planned one, up to which V is that of the planned one."""
 MOST_BLOCKS = 300
 """Blocks of pixels that are followed one by one; where there are more, neighbours are taken together."""
 MOST_CHANGES = 4
@@ -78,6 +94,28 @@ class Taken:
     """Passes over the radiograph, of all scales."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Awaited:
+    """What a radiograph's noise meets, and what the noise of views and flats does."""
+
+    step: int
+    angle_rad: float
+    amplitude: Floats
+    """At which it is known (1, section, motion), voxels."""
+    weighted: Sensitivities
+    """W S, in the window."""
+    covariance: Floats
+    """V of views and flats (unknown, unknown)."""
+    believed: Floats
+    """What the belief in e does (unknown,)."""
+
+    def fits(self, radiograph: Arrival, amplitude: Floats) -> bool:
+        """Return whether it holds for a radiograph that was found at amplitudes."""
+        away = np.sqrt(np.mean((amplitude - self.amplitude) ** 2))
+        turned = abs(radiograph.angle_rad - self.angle_rad)
+        return self.step == radiograph.step and turned <= AWAITED_RAD and bool(away <= AWAITED_VOXEL)
+
+
 class Tracker:
     """Follows a test of which angles and times are planned, from radiographs in nearly any order."""
 
@@ -99,6 +137,7 @@ class Tracker:
         rows, columns = self._rest[1].systematic.shape
         blocks = len(_larger_blocks(-(-rows // BAND_ROWS), -(-columns // BLOCK_COLUMNS)).T)
         self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS + blocks)
+        self._awaited: _Awaited | None = None
 
     def take(self, radiograph: Arrival) -> Taken:
         """Take in a radiograph; raises Late of `pdvc.lagged` where its step is too far behind the newest."""
@@ -107,9 +146,10 @@ class Tracker:
             return self._take(radiograph)
 
     def settle(self) -> None:
-        """Fit what the process is like, where it is time to: between radiographs, as it takes as long as some."""
+        """Do what can be done between radiographs: for the next one, and to know better what the process is like."""
         with threadpool_limits(limits=1, user_api="blas"):
             self._known.fit()
+            self._awaited = self._expecting(self._known.steps)
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that has to be known to be restored, but for what the steps `told` told."""
@@ -131,11 +171,13 @@ class Tracker:
             *(fine.images, fine.systematic, self._basis, amplitude, noise, equations.residual, amplitude.size),
             see=white.__setitem__,
         )
-        meets, told = self._told_by(fine, amplitude, equations, noise, radiograph.step)
+        if self._awaited is None or not self._awaited.fits(radiograph, amplitude):
+            self._awaited = self._meeting(fine, amplitude, noise, radiograph)
+        told = self._told_by(self._awaited, amplitude, equations, noise.step(0))
         self._known.add(radiograph.step, told)
         found, covariance = self._known.at(radiograph.step)
         if pattern is not None:
-            self._pattern.add(equations.residual[0], pattern.grey[fine.systematic.window], meets.image)
+            self._pattern.add(equations.residual[0], pattern.grey[fine.systematic.window], noise.step(0))
         return Taken(
             amplitude=found[:, 0].reshape(self._basis.shape),
             covariance=covariance + self._in_common(found[:, 1:]),
@@ -209,25 +251,55 @@ class Tracker:
                 at, equations = moved, trial
         return at.reshape(1, *self._basis.shape), equations, passes
 
-    def _told_by(
-        self, fine: Prepared, amplitude: Floats, equations: Equations, noise: Noise, step: int
-    ) -> tuple[StepNoise, Told]:
-        """Return what a radiograph's noise meets at amplitudes (1, section, motion), and what it told."""
+    def _expecting(self, step: int) -> _Awaited | None:
+        """Return what can be told of a radiograph before it comes, if one is planned and does not weigh its pixels."""
+        planned, options = self._setup.experiment.test, self._setup.options
+        if step >= len(planned) or options.weighting == "noise":
+            return None
+        reference, angle = self._setup.experiment.reference, float(planned.angle_rad[step])
+        # it will look much like the view from there
+        away = np.abs(np.mod(reference.angle_rad - angle + np.pi, 2 * np.pi) - np.pi)
+        alike = Arrival(
+            step=step,
+            file="",
+            angle_rad=angle,
+            time_s=float(planned.time_s[step]),
+            force_N=float(planned.force_N[step]),
+            counts=reference.counts[int(away.argmin())],
+        )
+        pattern = self._pattern.found() if options.remove_pattern else None
+        amplitude = (self._known.space.to_amplitude @ self._known.expected(step).mean).reshape(1, *self._basis.shape)
+        return self._meeting(self._images(alike, pattern)(1), amplitude, self._noise_of(alike, pattern), alike)
+
+    def _meeting(self, fine: Prepared, amplitude: Floats, noise: Noise, radiograph: Arrival) -> _Awaited:
+        """Return what a radiograph's noise meets at amplitudes (1, section, motion), and that of views and flats does."""
         images, systematic = replace(fine.images, volume=self._blurred), fine.systematic
         unknowns, rays = amplitude.size, images.rays
         sight = systematic.looked_along(slice(None), rays, self._basis, amplitude, images.voxel_mm)
         weighted = weighted_sensitivities(images, self._basis, amplitude, [0])[0]
         places = systematic.places(0, rays[0], self._basis, amplitude[0], images.voxel_mm)
         meets = StepNoise.of(noise, 0, sight.of_step(0), weighted, places, systematic.corner)
-        covariance = np.sum(list(meets.own(noise.flat, unknowns, self._pool).values()), axis=0)
+        covariance = meets.own(noise.flat, unknowns, ("views", "flats"), self._pool)
         left = registered_left(images, self._basis, amplitude, 0)
-        believed = np.zeros(unknowns) if left is None else BELIEF * adjoint(weighted, left, unknowns)
+        return _Awaited(
+            step=radiograph.step,
+            angle_rad=radiograph.angle_rad,
+            amplitude=amplitude,
+            weighted=weighted,
+            covariance=np.sum(list(covariance.values()), axis=0),
+            believed=np.zeros(unknowns) if left is None else BELIEF * adjoint(weighted, left, unknowns),
+        )
+
+    def _told_by(self, awaited: _Awaited, amplitude: Floats, equations: Equations, image: ImageNoise) -> Told:
+        """Return what a radiograph with a noise told, with the equations at amplitudes (1, section, motion)."""
+        unknowns, weighted = amplitude.size, awaited.weighted
+        covariance = awaited.covariance + product(weighted, weighted, image.variance, unknowns)
         data, white = seen(equations, covariance[None], amplitude.reshape(1, -1))
-        draws = np.random.default_rng((0, step)).standard_normal((unknowns, DRAWS))
+        draws = np.random.default_rng((0, awaited.step)).standard_normal((unknowns, DRAWS))
         each = by_block(equations.blocks, white, np.ones((1, 1)))[0]
         blocks = each @ _larger_blocks(*equations.blocks[0].values.shape[:2])
-        errors = np.column_stack([white[0] @ believed, draws, blocks]).astype(np.float32)
-        return meets, Told(design=data.design[0], data=data.data[0], errors=errors)
+        errors = np.column_stack([white[0] @ awaited.believed, draws, blocks]).astype(np.float32)
+        return Told(design=data.design[0], data=data.data[0], errors=errors)
 
     def _in_common(self, moved: Floats) -> Floats:
         """Return the covariance (unknown, unknown) of what steps have in common, from what errors do to amplitudes.
