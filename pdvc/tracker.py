@@ -32,7 +32,7 @@ from pdvc.coherent import by_block, excess
 from pdvc.equations import Equations, linearise
 from pdvc.experiment import Series
 from pdvc.incoming import Arrival
-from pdvc.lagged import LaggedFilter, Told
+from pdvc.lagged import Expected, LaggedFilter, Told
 from pdvc.measurement import ResidualTests
 from pdvc.noise import (
     BELIEF,
@@ -85,6 +85,10 @@ class Taken:
     """(section, motion), voxels."""
     covariance: Floats
     """(section * motion, the same), voxel^2."""
+    expected: Floats
+    """(section, motion), voxels: as the steps before it go on."""
+    uncertain: Floats
+    """The covariance of what was expected (section * motion, the same), voxel^2, should nothing be sudden."""
     told: Told
     residual: Image
     """Over its standard deviation (row, column), of the used window; zero where it is not used."""
@@ -164,7 +168,8 @@ class Tracker:
         pattern = self._pattern.found() if self._setup.options.remove_pattern else None
         images = self._images(radiograph, pattern)
         fine, noise = images(1), self._noise_of(radiograph, pattern)
-        amplitude, equations, passes = self._approached(images, radiograph.step)
+        expected = self._known.expected(radiograph.step)
+        amplitude, equations, passes = self._approached(images, expected)
         white = np.zeros_like(equations.residual)
         tests = self._pool.submit(
             residual_tests,
@@ -178,9 +183,12 @@ class Tracker:
         found, covariance = self._known.at(radiograph.step)
         if pattern is not None:
             self._pattern.add(equations.residual[0], pattern.grey[fine.systematic.window], noise.step(0))
+        to = self._known.space.to_amplitude
         return Taken(
             amplitude=found[:, 0].reshape(self._basis.shape),
             covariance=covariance + self._in_common(found[:, 1:]),
+            expected=(to @ expected.mean).reshape(self._basis.shape),
+            uncertain=to @ expected.covariance @ to.T,
             told=told,
             tests=tests.result(),
             residual=white[0],
@@ -209,9 +217,9 @@ class Tracker:
         flat = self._noise.flat if pattern is None else self._noise.flat * pattern.left
         return replace(self._noise, step=lambda _: own, flat=flat)
 
-    def _approached(self, images: Callable[[int], Prepared], step: int) -> tuple[Floats, Equations, int]:
+    def _approached(self, images: Callable[[int], Prepared], expected: Expected) -> tuple[Floats, Equations, int]:
         """Return amplitudes (1, section, motion), voxels, the equations there at scale 1, and the number of passes."""
-        expected, passes = self._known.expected(step), 0
+        step, passes = expected.step, 0
         starts = [self._known.space.to_amplitude @ expected.mean]
         if step:
             # after few steps what is expected may be further off than where the sample was
@@ -272,7 +280,7 @@ class Tracker:
         return self._meeting(self._images(alike, pattern)(1), amplitude, self._noise_of(alike, pattern), alike)
 
     def _meeting(self, fine: Prepared, amplitude: Floats, noise: Noise, radiograph: Arrival) -> _Awaited:
-        """Return what a radiograph's noise meets at amplitudes (1, section, motion), and that of views and flats does."""
+        """Return what the noise meets at amplitudes (1, section, motion), and what that of views and flats does."""
         images, systematic = replace(fine.images, volume=self._blurred), fine.systematic
         unknowns, rays = amplitude.size, images.rays
         sight = systematic.looked_along(slice(None), rays, self._basis, amplitude, images.voxel_mm)
