@@ -25,6 +25,8 @@ AIR_ERROR, AIR_DOUBT = 0.3, 0.03
 """Departures of the air's transmission from 1 that are refused, and doubted."""
 SATURATED = 1e-3
 """Share of pixels at the largest count above which a stack is clipped: of ten thousand pixels one is chance."""
+EDGE_SEEN = 0.02
+"""Share of rows above which a sample covers a side of the detector."""
 STEEP, FLAT_SHARE = 0.65, 0.25
 """Rise of attenuation within one column that a flat face along the beam makes; share of steps that may have it."""
 NOISE_FACTOR = 1.5
@@ -203,7 +205,7 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 "other angles",
                 steps=_steps(name, flat),
             )
-        cut = np.flatnonzero(look.edge > 0.02)
+        cut = np.flatnonzero(look.edge > EDGE_SEEN)
         if len(cut):
             yield Doubt(
                 name="out-of-view",

@@ -101,7 +101,7 @@ def examine(experiment: Experiment, *, progress: Progress = silent) -> Examinati
     total, done = sum(len(each) for each in series.values()), 0
     stacks = {}
     for name, each in series.items():
-        stacks[name] = _look(each.counts, calibration)
+        stacks[name] = look_at(each.counts, calibration)
         done += len(each)
         progress("examine", done, total)
     return Examination(
@@ -129,7 +129,8 @@ def with_angles(found: Examination, experiment: Experiment, *, progress: Progres
     return replace(found, seen_twice=twice, likeness=like)
 
 
-def _look(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
+def look_at(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
+    """Return what images of counts (image, row, column) look like."""
     rows, columns = counts.shape[1:]
     every = max(1, rows * columns // _PIXELS)
     some = np.s_[::every]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from pdvc.experiment import Experiment
+from pdvc.geometry import ConeBeam
 from pdvc.radiographs import Calibration, binned, grey_levels
 
 Floats = NDArray[np.float64]
@@ -82,13 +83,10 @@ def neighbouring_views(reference_rad: Floats, test_rad: Floats) -> Neighbours:
 
 def likeness(experiment: Experiment, calibration: Calibration) -> Likeness:
     """Compare the radiographs of the test with the reference views."""
-    geometry, reference, test = experiment.geometry, experiment.reference, experiment.test
-    bins = max(1, round(min(geometry.rows / ROWS, geometry.columns / 40)))
-    near = neighbouring_views(reference.angle_rad, test.angle_rad)
-    nearest = np.where(near.share > 0.5, near.second, near.first)
+    reference, test = experiment.reference, experiment.test
+    bins, compare = _comparison(experiment.geometry)
     few = calibration.binned(bins)
-    compare = _Compare((geometry.rows // bins, geometry.columns // bins))
-    own, place = np.unique(nearest, return_inverse=True)
+    own, place = np.unique(_nearest(reference.angle_rad, test.angle_rad), return_inverse=True)
     views = compare.prepared(_images(reference.counts, few, bins, own))
     steps = compare.prepared(_images(test.counts, few, bins, np.arange(len(test))))
     recorded = np.array([compare.pair(steps[t], views[v]) for t, v in enumerate(place)])
@@ -120,6 +118,39 @@ def likeness(experiment: Experiment, calibration: Calibration) -> Likeness:
         upside_down=with_all(test.counts[:, ::-1]).max(axis=1),
         mirrored=with_all(test.counts[:, :, ::-1]).max(axis=1),
     )
+
+
+class Beside:
+    """Compares a radiograph with the one before it, and with the view from where the stage should be by now."""
+
+    def __init__(self, experiment: Experiment, calibration: Calibration) -> None:
+        self._reference = experiment.reference
+        self._bins, self._compare = _comparison(experiment.geometry)
+        self._few = calibration.binned(self._bins)
+
+    def binned(self, counts: NDArray[np.uint16]) -> Image:
+        """Return the picture (row, column) that is compared, of counts (row, column)."""
+        return np.asarray(_images(counts[None], self._few, self._bins, np.zeros(1, dtype=np.int64))[0])
+
+    def likeness(self, picture: Image, angle_rad: float, before: Image) -> tuple[float, float]:
+        """Return the correlations of a picture with the reference view at its angle, and with the picture before."""
+        nearest = int(_nearest(self._reference.angle_rad, np.array([angle_rad]))[0])
+        view = self.binned(self._reference.counts[nearest])
+        this, *others = self._compare.prepared(np.stack([picture, view, before]))
+        recorded, like = (self._compare.pair(this, other) for other in others)
+        return recorded, like
+
+
+def _comparison(geometry: ConeBeam) -> tuple[int, _Compare]:
+    """Return the pixels that are binned into one, along each axis, and what compares such pictures."""
+    bins = max(1, round(min(geometry.rows / ROWS, geometry.columns / 40)))
+    return bins, _Compare((geometry.rows // bins, geometry.columns // bins))
+
+
+def _nearest(reference_rad: Floats, test_rad: Floats) -> NDArray[np.int64]:
+    """Return the reference view that is nearest to each test angle."""
+    near = neighbouring_views(reference_rad, test_rad)
+    return np.asarray(np.where(near.share > 0.5, near.second, near.first))
 
 
 def _images(counts: NDArray[np.uint16], few: Calibration, bins: int, which: NDArray[np.int64]) -> Image:

@@ -2,7 +2,8 @@
 
 After the reference scan, `make_ready` prepares all that does not depend on the test and keeps it. `follow` takes each
 radiograph as soon as it is whole (`pdvc.incoming`), finds the motion (`pdvc.tracker`), and adds it to the record
-(`pdvc.record`); when all that are planned are in, the whole test is measured as in `pdvc.protocol`.
+(`pdvc.record`), with what is alarming (`pdvc.alarms`); when all that are planned are in, the whole test is measured as
+in `pdvc.protocol`.
 
 What the tracker knows is kept before a line is added to the record, line included: a process that is killed and
 started again goes on with the radiograph that it had in hand, to the same numbers.
@@ -20,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.alarms import Alarm, Watch
 from pdvc.compilation import compile_kernels
 from pdvc.deviations import beam_frame, strain_std, turned_std
 from pdvc.digest import digest
@@ -31,7 +33,7 @@ from pdvc.measurement import Measurement
 from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.progress import Progress, silent
 from pdvc.radiograph_table import TABLE
-from pdvc.record import Line, LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
+from pdvc.record import AlarmLine, Line, LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
 from pdvc.resumable import measure_into
 from pdvc.setup import Setup, set_up
 from pdvc.store import Arrays, experiment_digest, read_arrays, write_arrays
@@ -131,6 +133,7 @@ class _Follower:
     ) -> None:
         """Begin, or resume where the record ends; raises ValueError where it belongs to another test."""
         self._setup, self._tracker, self._radiographs = setup, tracker, radiographs
+        self._watch = Watch(setup)
         self._record, self._folder, self._tell, self._see = record, folder, tell, see
         self._key = digest("live", experiment_digest(setup.experiment), setup.options, str(radiographs.resolve()))
         plan = PlanLine(
@@ -148,6 +151,7 @@ class _Follower:
         lines = list(read_record(record.path))
         self._done = {line.step for line in lines if isinstance(line, StepLine)}
         self._lost = {_which(line) for line in lines if isinstance(line, LostLine)}
+        self._alarmed = {(line.step, line.alarm) for line in lines if isinstance(line, AlarmLine)}
         # what was lost is looked at again, and said once
         self._incoming = self._opened(self._done)
 
@@ -174,12 +178,14 @@ class _Follower:
         return bool(arrived or given_up)
 
     def recorded(self) -> Experiment:
-        """Return the experiment with all radiographs that have come, in the order of steps.
+        """Return the experiment with all radiographs that have come and show the sample, in the order of steps.
 
         Raises ExperimentError where none has, or one that was followed cannot be read any more.
         """
-        arrived, _ = self._opened(()).look()
-        followed = {line.step for line in read_record(self._record.path) if isinstance(line, StepLine)}
+        lines = list(read_record(self._record.path))
+        spoilt = {line.step for line in lines if isinstance(line, LostLine) and not line.whole_test}
+        followed = {line.step for line in lines if isinstance(line, StepLine)}
+        arrived = [each for each in self._opened(()).look()[0] if each.step in followed or each.step not in spoilt]
         gone = sorted(followed - {each.step for each in arrived})
         if gone or not arrived:
             found = f"that of step {listed(gone)} not any more" if gone else "none"
@@ -200,10 +206,17 @@ class _Follower:
     def _take(self, arrival: Arrival) -> None:
         started = time.perf_counter()
         self._done.add(arrival.step)
+        seen = self._watch.seen(arrival)
+        if any(alarm.spoils for alarm in seen):
+            self._alarm(arrival.step, self._watch.new(arrival.step, seen))
+            reason = "; ".join(alarm.reason for alarm in seen if alarm.spoils)
+            self._say_lost(arrival.step, arrival.file, f"step {arrival.step}: {reason}")
+            return
         try:
             taken = self._tracker.take(arrival)
         except Late as error:
-            self._say_lost(arrival.step, arrival.file, f"{error}: only the measurement of the whole test has it")
+            reason = f"{error}: only the measurement of the whole test has it"
+            self._say_lost(arrival.step, arrival.file, reason, whole_test=True)
             return
         except ValueError as error:
             # a radiograph that shows another thing than the sample is no reason to stop
@@ -211,10 +224,13 @@ class _Follower:
             state = read_arrays(self._folder / _STATE)
             if state is not None:
                 self._recall(state)
+            self._alarm(arrival.step, self._watch.new(arrival.step, seen))
             return
         line = _line(self._setup, arrival, taken, time.perf_counter() - started)
-        self._keep(arrival.step, taken.told, line)
+        alarms = self._watch.new(arrival.step, (*seen, *self._watch.followed(line, taken)))
+        self._keep(arrival.step, taken.told, (line, *(alarm.line(arrival.step) for alarm in alarms)))
         self._add(line)
+        self._alarm(arrival.step, alarms)
         self._see(arrival, taken)
         # after the motion is told, and not when there is time: what comes out must not depend on the clock
         self._tracker.settle()
@@ -223,18 +239,27 @@ class _Follower:
         self._record.add(line)
         self._tell(line)
 
-    def _say_lost(self, step: int, file: str, reason: str) -> None:
+    def _alarm(self, step: int, alarms: Iterable[Alarm]) -> None:
+        """Add alarms of a step: each once, however often the test is resumed."""
+        for line in (alarm.line(step) for alarm in alarms):
+            if (step, line.alarm) not in self._alarmed:
+                self._alarmed.add((step, line.alarm))
+                self._add(line)
+
+    def _say_lost(self, step: int, file: str, reason: str, *, whole_test: bool = False) -> None:
         """Say that a radiograph cannot be used: once, however often the test is resumed."""
-        line = LostLine(step=step, file=file, reason=reason)
+        line = LostLine(step=step, file=file, reason=reason, whole_test=whole_test)
         if _which(line) not in self._lost:
             self._lost.add(_which(line))
             self._add(line)
 
-    def _keep(self, step: int, told: Told, line: StepLine) -> None:
+    def _keep(self, step: int, told: Told, lines: Iterable[Line]) -> None:
         """Keep what is needed to resume after this step; the state tells of which steps it needs what they told."""
         write_arrays(self._told_file(step), vars(told))
         state = self._tracker.kept()
-        write_arrays(self._folder / _STATE, {**state, "key": np.array(self._key), "line": np.array(line.text())})
+        watched = {_WATCH + name: values for name, values in self._watch.kept().items()}
+        texts = np.array([line.text() for line in lines])
+        write_arrays(self._folder / _STATE, {**state, **watched, "key": np.array(self._key), "lines": texts})
         needed = {self._told_file(t) for t in state["told"].tolist()}
         for old in set(self._folder.glob(f"*{_TOLD}")) - needed:
             old.unlink(missing_ok=True)
@@ -251,14 +276,15 @@ class _Follower:
             )
         if state is None:
             return
-        line = str(state["line"])
+        line, *alarms = state["lines"].tolist()
         if str(state["key"]) != self._key or (line in steps and line != steps[-1]):
             raise ValueError(
                 f"{path}: expected the same reference scan, plan, options, folder and software as now, and as much as "
                 "the record tells, found others: choose another file"
             )
-        if line not in steps:
-            self._record.add_text(line)
+        for text in (line, *alarms):
+            if text not in self._record.lines:
+                self._record.add_text(text)
         self._recall(state)
 
     def _recall(self, state: Arrays) -> None:
@@ -272,6 +298,7 @@ class _Follower:
                 )
             told[step] = Told(**found)
         self._tracker.restore(state, told)
+        self._watch.restore({name[len(_WATCH) :]: state[name] for name in state if name.startswith(_WATCH)})
         self._tracker.settle()
 
     def _told_file(self, step: int) -> Path:
@@ -283,7 +310,7 @@ def _which(line: LostLine) -> tuple[int, str, str]:
     return line.step, line.file, line.reason if line.file == TABLE else ""
 
 
-_STATE, _TOLD = "state.kept", ".told.kept"
+_STATE, _TOLD, _WATCH = "state.kept", ".told.kept", "watch_"
 
 
 def _line(setup: Setup, arrival: Arrival, taken: Taken, seconds: float) -> StepLine:

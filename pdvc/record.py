@@ -121,6 +121,8 @@ class LostLine(Line):
     """-1 where it is not known."""
     file: str
     reason: str
+    whole_test: bool = False
+    """Whether the measurement of the whole test has it all the same."""
 
     def words(self) -> str:
         """Return the line for a reader."""

@@ -1,0 +1,263 @@
+"""Alarms of a test that is followed: what a person, or the machine that pulls, should know at once.
+
+| alarm | what is tested | limit |
+| --- | --- | --- |
+| beam | transmission of the air beside the sample, less 1 | 0.03; from 0.3 on the radiograph is lost |
+| saturation | share of pixels at the largest count | 0.001 |
+| out-of-view | share of rows in which the sample covers a side of the detector, or a section that is off it | 0.02 |
+| stage | likeness to the radiograph before, less that to the reference view at the recorded angle | 0.1, then lost |
+| sudden | a rigid motion that differs from what was expected, over what is usual and what was uncertain | 6 |
+| localisation | a section's strain that grew in `SPAN` steps, beyond its usual share, over its deviation | 5 |
+| crack | residual that is new somewhere on the sample, over its deviation (`pdvc.cells`) | 7 |
+
+One that goes on is raised once, and again after `QUIET` steps without it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.cells import Cells
+from pdvc.data_checks import AIR_DOUBT, AIR_ERROR, ALIKE, EDGE_SEEN, SATURATED
+from pdvc.examination import StackLook, full_scale, look_at
+from pdvc.incoming import Arrival
+from pdvc.likeness import Beside
+from pdvc.record import AlarmLine, StepLine
+from pdvc.setup import Setup
+from pdvc.tracker import Taken
+from pdvc.window import height_mm
+
+Floats = NDArray[np.float64]
+
+SUDDEN, LOCAL, CRACK = 6.0, 5.0, 7.0
+"""Limits of what is over its deviation."""
+USUAL = 20
+"""Steps that tell what is usual."""
+LEAST_USUAL = 8
+"""The same, at least: before that nothing is unusual."""
+SPAN = 8
+"""Steps over which strain grows, to be compared with as many before."""
+LOCAL_SHARE = 0.5
+"""Share by which a section's strain grew more than was its part, at least."""
+CERTAIN = 3.0
+"""Deviations of its growth by which the sample has to stretch, for its sections to have a share."""
+TURNED_VOXEL = 4.0
+"""Voxels by which the outline turns from a radiograph to the next, for the two to look different."""
+QUIET = 10
+"""Steps without an alarm after which it is raised anew."""
+_MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alarm:
+    """Something that a radiograph shows, and should not."""
+
+    name: str
+    value: float
+    limit: float
+    reason: str
+    place_mm: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    """Where on the sample, as it was at rest (x, y, z), as far as it is known."""
+    spoils: bool = False
+    """Whether the motion cannot be told from this radiograph."""
+
+    def line(self, step: int) -> AlarmLine:
+        """Return its line for a record."""
+        place = self.place_mm
+        return AlarmLine(
+            step=step, alarm=self.name, value=self.value, limit=self.limit, reason=self.reason, place_mm=place
+        )
+
+
+class Watch:
+    """Watches a test: each radiograph as it comes, and the motion that was found."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Begin without a radiograph."""
+        self._setup, self._names = setup, setup.sections.names
+        self._beside = Beside(setup.experiment, setup.calibration)
+        self._cells = Cells(setup.geometry.cropped(*setup.window), setup.sections, setup.outline.hull)
+        some = np.linspace(0, len(setup.experiment.reference) - 1, 24).astype(int)
+        reference = look_at(setup.experiment.reference.counts[some], setup.calibration)
+        flats, self._edge = setup.experiment.flats, float(reference.edge.max())
+        # a beam without noise, on a detector without pattern, has one count in most pixels
+        self._clips = float((flats == flats.max()).mean()) < SATURATED
+        self._newest, self._angle_rad = -1, math.nan
+        self._before = np.zeros((0, 0), dtype=np.float32)
+        self._last: dict[str, int] = {}
+        self._jumps: list[Floats] = []
+        self._strains: list[tuple[Floats, Floats]] = []
+
+    def seen(self, radiograph: Arrival) -> tuple[Alarm, ...]:
+        """Look at a radiograph before anything is measured on it; return all that is wrong with it."""
+        found = list(self._of_counts(look_at(radiograph.counts[None], self._setup.calibration)))
+        if radiograph.step > self._newest and not any(alarm.spoils for alarm in found):
+            found += self._of_stage(radiograph)
+        return tuple(found)
+
+    def followed(self, line: StepLine, taken: Taken) -> tuple[Alarm, ...]:
+        """Look at the motion that was found; return all that is wrong. Steps older than the newest are left out."""
+        if line.step <= self._newest:
+            return ()
+        self._newest = line.step
+        spot = self._cells.add(taken.residual, taken.amplitude, np.deg2rad(line.angle_deg))
+        found = [*self._of_place(taken), *self._of_motion(taken), *self._of_strain(line)]
+        if self._cells.steps > LEAST_USUAL and spot.score > CRACK:
+            x, y, z = spot.place_mm
+            where = f"x = {x:.2f}, y = {y:.2f}, z = {z:.2f} mm"
+            found.append(
+                Alarm(
+                    name="crack",
+                    value=spot.score,
+                    limit=CRACK,
+                    reason=f"at {where} the residual shows less material than before, by {spot.score:.1f} deviations",
+                    place_mm=spot.place_mm,
+                )
+            )
+        return tuple(found)
+
+    def new(self, step: int, alarms: tuple[Alarm, ...]) -> tuple[Alarm, ...]:
+        """Return those of a step's alarms that did not go on from the steps before."""
+        fresh = [alarm for alarm in alarms if step > self._last.get(alarm.name, -QUIET - 1) + QUIET]
+        for alarm in alarms:
+            self._last[alarm.name] = max(step, self._last.get(alarm.name, step))
+        return tuple(fresh)
+
+    def kept(self) -> dict[str, NDArray[Any]]:
+        """Return all that has to be known to be restored."""
+        strain = np.array(self._strains).reshape(len(self._strains), 2, -1)
+        return {
+            **self._cells.kept(),
+            "newest": np.array(self._newest),
+            "angle": np.array(self._angle_rad),
+            "before": self._before,
+            "names": np.array(list(self._last), dtype=str),
+            "last": np.array(list(self._last.values()), dtype=np.int64),
+            "jumps": np.array(self._jumps).reshape(len(self._jumps), -1),
+            "strains": strain,
+        }
+
+    def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
+        """Know again what it knew when `kept` was asked."""
+        self._cells.restore(kept)
+        self._newest, self._angle_rad, self._before = int(kept["newest"]), float(kept["angle"]), kept["before"]
+        self._last = dict(zip(kept["names"].tolist(), kept["last"].tolist(), strict=True))
+        self._jumps = list(kept["jumps"])
+        self._strains = [(strain, deviation) for strain, deviation in kept["strains"]]
+
+    def _of_counts(self, look: StackLook) -> Iterator[Alarm]:
+        """Give what is wrong with the counts of a radiograph."""
+        edge, air, top, covered = self._edge, float(look.air[0]), float(look.at_top[0]), float(look.edge[0])
+        if not abs(air - 1) <= AIR_DOUBT:
+            lost = not abs(air - 1) <= AIR_ERROR
+            yield Alarm(
+                name="beam",
+                value=abs(air - 1),
+                limit=AIR_DOUBT,
+                reason=f"air has a transmission of {air:.2f} where 1 is due",
+                spoils=lost,
+            )
+        if top > SATURATED and (full_scale(look.highest) or self._clips):
+            yield Alarm(
+                name="saturation",
+                value=top,
+                limit=SATURATED,
+                reason=f"{top:.1%} of the pixels are at the largest count, {look.highest}",
+            )
+        if covered > edge + EDGE_SEEN:
+            yield Alarm(
+                name="out-of-view",
+                value=covered,
+                limit=edge + EDGE_SEEN,
+                reason=f"the sample covers a side of the detector in {covered:.0%} of the rows",
+            )
+
+    def _of_stage(self, radiograph: Arrival) -> Iterator[Alarm]:
+        picture, angle = self._beside.binned(radiograph.counts), radiograph.angle_rad
+        before, turned = self._before, abs(angle - self._angle_rad)
+        outline = self._setup.outline.hull.radius_mm() / self._setup.geometry.voxel_mm
+        # a whole turn on, it looks as before
+        away = abs((turned + np.pi) % (2 * np.pi) - np.pi)
+        if before.size and away * outline > TURNED_VOXEL:
+            recorded, like = self._beside.likeness(picture, angle, before)
+            if like - recorded > ALIKE:
+                yield Alarm(
+                    name="stage",
+                    value=like - recorded,
+                    limit=ALIKE,
+                    reason=f"like the radiograph before (correlation {like:.2f}), {np.rad2deg(turned):.1f} degrees "
+                    f"from the recorded angle, rather than like the view from there ({recorded:.2f})",
+                    spoils=True,
+                )
+                return
+        self._before, self._angle_rad = picture, angle
+
+    def _of_place(self, taken: Taken) -> Iterator[Alarm]:
+        basis, geometry = self._setup.sections, self._setup.geometry
+        ends = np.zeros((2, 3))
+        ends[:, 2] = basis.height_mm[[0, -1]]
+        moved = ends[:, 2] + basis.displacement(taken.amplitude, ends)[:, 2] * geometry.voxel_mm
+        top, bottom = height_mm(geometry, 0), height_mm(geometry, geometry.rows - 1)
+        off = max(float(moved.max()) - top, bottom - float(moved.min())) / geometry.voxel_mm
+        if off > 0:
+            yield Alarm(
+                name="out-of-view",
+                value=off,
+                limit=0.0,
+                reason=f"the outermost section is {off:.1f} rows off the detector",
+            )
+
+    def _of_motion(self, taken: Taken) -> Iterator[Alarm]:
+        """Compare the rigid motion, the mean over the sections, with what was expected."""
+        sections, motions = taken.amplitude.shape
+        mean = np.tile(np.eye(motions), sections) / sections
+        jump = mean @ (taken.amplitude - taken.expected).ravel()
+        past, self._jumps = self._jumps, [*self._jumps[-USUAL + 1 :], jump]
+        if len(past) < LEAST_USUAL:
+            return
+        usual = _MAD * np.median(np.abs(past), axis=0)
+        score = np.abs(jump) / np.sqrt(usual**2 + np.einsum("mu,uv,mv->m", mean, taken.uncertain, mean))
+        most = int(np.argmax(score))
+        if score[most] > SUDDEN:
+            yield Alarm(
+                name="sudden",
+                value=float(score[most]),
+                limit=SUDDEN,
+                reason=f"{self._names[most]} changed by {jump[most]:+.2f} voxel against what was expected, "
+                f"{score[most]:.0f} deviations of what is usual",
+            )
+
+    def _of_strain(self, line: StepLine) -> Iterator[Alarm]:
+        """Compare how strain grew, section by section, with how it grew before."""
+        self._strains = [*self._strains[-2 * SPAN :], (np.array(line.strain), np.array(line.strain_std))]
+        if len(self._strains) <= 2 * SPAN or not line.strain:
+            return
+        (first, _), (middle, between), (last, now) = (self._strains[k] for k in (0, SPAN, 2 * SPAN))
+        before, grown = middle - first, last - middle
+        # errors of neighbouring steps are alike: this is more than that of their difference
+        variance = now**2 + between**2
+        certain = CERTAIN * math.sqrt(float(variance.sum()))
+        if before.sum() < certain or grown.sum() < certain:
+            return
+        share = float(grown.sum() / before.sum())
+        excess = grown - share * before
+        score = excess / np.sqrt(variance * (1 + share**2))
+        most = int(np.argmax(score))
+        if score[most] > LOCAL and excess[most] > LOCAL_SHARE * abs(share * before[most]):
+            height = self._setup.sections.height_mm
+            place = float(height[most : most + 2].mean())
+            yield Alarm(
+                name="localisation",
+                value=float(score[most]),
+                limit=LOCAL,
+                reason=f"at z = {place:.2f} mm strain grew by {100 * grown[most]:.2f} % in {SPAN} steps, where its "
+                f"part is {100 * share * before[most]:.2f} %",
+                place_mm=(math.nan, math.nan, place),
+            )
