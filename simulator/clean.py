@@ -27,6 +27,8 @@ from simulator.xray import read_spectrum
 
 _EVERY_IMAGE = ("subpixels", "exposure_samples", "exposure_share", "start_deg")
 _TEST = ("test_steps", "steps_per_turn", "step_s")
+_OPENING = ("first_step", "opening_steps")
+"""Of a crack, when it opens: the reference scan depends on where it will be, which nodules keep clear of."""
 
 
 def clean_file(scenario: Scenario, stack: Stack) -> str:
@@ -83,10 +85,12 @@ def _compute(scenario: Scenario, stack: Stack, path: Path, progress: Progress, w
 
 def _depends_on(scenario: Scenario, stack: Stack) -> dict[str, Any]:
     parts, plan = {"seed", "specimen", "graphite", "geometry", "misalignment", "xray"}, set(_EVERY_IMAGE)
+    opening = set(_OPENING)
     if stack.kind != "reference":
         # motion refers to the height that the discarded rows leave
         parts |= {"discarded_rows", "loading", "motion"}
         plan |= set(_TEST)
+        opening.clear()
     spectrum = read_spectrum(scenario.xray.spectrum)
     return {
         "software": software("simulator"),
@@ -95,5 +99,6 @@ def _depends_on(scenario: Scenario, stack: Stack) -> dict[str, Any]:
         "spectrum": [spectrum.energy_keV.tolist(), spectrum.fluence.tolist()],
         "blur_px": scenario.detector.blur_px,
         **scenario.model_dump(mode="json", include=parts),
+        "crack": scenario.crack.model_dump(mode="json", exclude=opening),
         "acquisition": scenario.acquisition.model_dump(mode="json", include=plan),
     }

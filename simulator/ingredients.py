@@ -8,8 +8,9 @@ They are carried out in this order, from the material outwards:
 3. ``backlash``: it moves between reference scan and test, and again when the stroke starts;
 4. ``wobble``: the stage turns about another axis than during the reference scan. Fixed in the lab, this is a
    sine and a cosine of the stage angle in the sample frame;
-5. only where a scenario asks for them: ``creep`` and ``ripple``, with the deformations, and ``wander``, a random
-   motion of the whole. No time function follows creep and wandering; a ripple asks what the sections follow.
+5. only where a scenario asks for them: ``creep`` and ``ripple``, with the deformations; ``slip``, of the deformed
+   sample in its grips, before the machine moves both; and ``wander``, a random motion of the whole. No time function
+   follows creep, slip and wandering; a ripple asks what the sections follow.
 
 One more is one more record here, a `Deforming` or a `Moving` one, and its field in `MotionOptions`.
 
@@ -152,6 +153,24 @@ class Torsion(Deforming):
         """Return rotations about z."""
         twist = np.deg2rad(self.angle_deg) * drive.moment_share()[:, None] * np.array([0.0, 0.0, 1.0])
         return Deformation(twist_rad=drive.history.load_fraction[:, None, None] * twist)
+
+
+class Slip(Moving):
+    """A single sudden slip of the sample in its grips: from a step on it stays where it slipped to."""
+
+    step: Annotated[int, Field(ge=0)] = 80
+    """first step, counted from 0, at which the sample has slipped"""
+    shift_mm: Vector = (0.0, 0.0, -0.05)
+    """shift (x, y, z), mm"""
+    turn_deg: Vector = (0.0, 0.0, 1.15)
+    """rotation vector (x, y, z), about the origin, degrees"""
+
+    def motion(self, drive: Drive) -> RigidMotion:
+        """Return rest before the step, and from it on one rigid motion."""
+        slipped = np.where(np.arange(len(drive.angle_rad)) < self.step, 0.0, 1.0)[:, None]
+        return RigidMotion(
+            rotation_rad=slipped * np.deg2rad(self.turn_deg), translation_mm=slipped * np.array(self.shift_mm)
+        )
 
 
 class Compliance(Moving):
@@ -327,6 +346,8 @@ class MotionOptions(Settings):
     """bending with the force"""
     torsion: Torsion = Torsion()
     """twist with the force"""
+    slip: Slip = Slip()
+    """sudden slip in the grips"""
     compliance: Compliance = Compliance()
     """the machine gives way to the force"""
     backlash: Backlash = Backlash()

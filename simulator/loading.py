@@ -57,11 +57,13 @@ class Loading(Settings):
     compliance_mm_per_N: NotNegative = 2.919e-4
     """machine compliance C, mm/N: stroke that does not reach the modelled sample"""
     necking_strain: NotNegative = 0.012
-    """strain added by necking in the middle of the ligament at the last step, without unit"""
+    """strain added by necking in the middle of the neck at the last step, without unit"""
     necking_steps: Annotated[int, Field(ge=1)] = 8
     """steps before the last one during which necking grows, quadratically"""
     necking_mm: Positive = 0.25
     """standard deviation of the neck along z, mm"""
+    necking_at_mm: float = 0.0
+    """height of the neck's middle above that of the ligament, mm"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +145,7 @@ def _force(loading: Loading, drive_mm: Floats, height_mm: Floats, area_mm2: Floa
 
 def _necking(loading: Loading, steps: int, height_mm: Floats) -> tuple[Floats, Floats]:
     """Return the neck's strain along z at the last step, and its growth from 0 to 1 over the steps."""
-    neck = loading.necking_strain * np.exp(-0.5 * (height_mm / loading.necking_mm) ** 2)
+    neck = loading.necking_strain * np.exp(-0.5 * ((height_mm - loading.necking_at_mm) / loading.necking_mm) ** 2)
     since = np.arange(steps) - (steps - 1 - loading.necking_steps)
     growth = np.clip(since / loading.necking_steps, 0.0, 1.0) ** 2
     # a test without stroke has no neck either

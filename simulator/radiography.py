@@ -18,12 +18,20 @@ length in depth becomes a length along the ray by the factor |d|.
     2 |d| |det A| sqrt(|adj(A) d|^2 - |A' f|^2) / |adj(A) d|^2.
 
 Both sides are quadratic in the pixel coordinates, so that the nodule's silhouette is known row by row.
+
+*Crack*: the same ellipsoid, of air, and so flat that it may lie between two rows of sub-pixel centres. Each sub-pixel
+therefore takes the mean of the chord over its area. With D(x, y) = |adj(A) d|^2 - |A' f|^2 = a (h^2 - (y - m)^2) along
+a column, in which a, h and m depend on the column, the substitution y = m + h sin(phi) leaves
+
+    integral of chord dy = 2 |d| |det A| sqrt(a) integral of h^2 cos^2(phi) / |adj(A) d|^2 dphi,
+
+whose integrand is smooth between the edges of a sub-pixel: Gauss and Legendre's rule, and likewise across the columns.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numba
 import numpy as np
@@ -31,6 +39,9 @@ from numpy.typing import NDArray
 
 from pdvc.geometry import ConeBeam
 from simulator.rounding import fused
+
+_NODE, _WEIGHT = (np.polynomial.legendre.leggauss(8) + np.array([[1.0], [0.0]])) / 2
+"""Nodes between 0 and 1, and weights, of Gauss and Legendre's rule."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,14 +56,20 @@ class Body:
     """Centres (n, 3) of the nodules, mm."""
     shapes_mm: NDArray[np.float64]
     """Shapes (n, 3, 3), mm: the nodule is {centre + A s, |s| <= 1}; A = deformation gradient x radius."""
+    crack_centres_mm: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    """Centres (m, 3) of cracks in the matrix, mm."""
+    crack_shapes_mm: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    """Shapes (m, 3, 3), mm: as those of nodules, but of air."""
 
     def __post_init__(self) -> None:
-        v, f, n = len(self.vertices_mm), len(self.faces), len(self.centres_mm)
+        v, f, n, m = (len(part) for part in (self.vertices_mm, self.faces, self.centres_mm, self.crack_centres_mm))
         for name, shape in (
             ("vertices_mm", (v, 3)),
             ("faces", (f, 3)),
             ("centres_mm", (n, 3)),
             ("shapes_mm", (n, 3, 3)),
+            ("crack_centres_mm", (m, 3)),
+            ("crack_shapes_mm", (m, 3, 3)),
         ):
             found = np.shape(getattr(self, name))
             if found != shape:
@@ -66,7 +83,8 @@ def path_lengths(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the lengths of every ray in matrix and in graphite, at the sub-pixel centres.
 
-    Shapes (rows * subpixels, columns * subpixels), mm; matrix = chord of the surface - chords of the nodules.
+    Shapes (rows * subpixels, columns * subpixels), mm; matrix = chord of the surface - chords of the nodules - mean
+    chords of the cracks, over each sub-pixel. Cracks are expected inside the surface, and clear of nodules.
     One call uses one thread and releases the interpreter: run radiographs side by side in threads.
     Raises ValueError where the object reaches the source or the detector.
     """
@@ -76,13 +94,16 @@ def path_lengths(
     turn = math.cos(angle_rad), math.sin(angle_rad)
     vertices = _from_source(body.vertices_mm, turn, geometry.source_axis_mm)
     centres = _from_source(body.centres_mm, turn, geometry.source_axis_mm)
-    for points in (vertices, centres):
+    cracks = _from_source(body.crack_centres_mm, turn, geometry.source_axis_mm)
+    for points in (vertices, centres, cracks):
         _check_depth(points[:, 0], geometry, angle_rad)
     # depths of some 30 mm that cancel to a length of 1 mm: in double precision
     surface = np.zeros((fine.rows, fine.columns))
     _add_surface(
         surface, *fine.image_of(vertices), 1 / vertices[:, 0], np.ascontiguousarray(body.faces, dtype=np.int64)
     )
+    if len(cracks):
+        _take_cracks(surface, cracks, body.crack_shapes_mm, turn, *fine.image_of(cracks), *fine.rays()[1:])
     graphite = np.zeros((fine.rows, fine.columns), dtype=np.float32)
     _add_nodules(graphite, centres, body.shapes_mm, turn, *fine.image_of(centres), *fine.rays())
     return _lengths(surface, graphite, *fine.rays()), graphite
@@ -313,6 +334,68 @@ def _add_nodules(total, centres, shapes, turn, column, row, d0, by_column, by_ro
                 chord[k] = twice_det * math.sqrt(square) / (t0 + x * (tx + x * txx))
             for k in range(len(line)):
                 line[k] += chord[k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _take_cracks(total, centres, shapes, turn, column, row, by_column, by_row):  # type: ignore[no-untyped-def]
+    """Take each crack's chord, in depth, from the sub-pixels that it covers: the mean over the area of each.
+
+    As in `_add_nodules`, but (x, y) count columns and rows from the very image of the centre: there f = 0, and nothing
+    cancels however flat the crack is. A sub-pixel that lies in part beside the crack is integrated over the rest.
+    """
+    rows, columns = total.shape
+    dx, dy = (by_column[0], by_column[1], by_column[2]), (by_row[0], by_row[1], by_row[2])
+    for n in range(len(centres)):
+        c = (centres[n, 0], centres[n, 1], centres[n, 2])
+        d = (1.0, c[1] / c[0], c[2] / c[0])
+        a1, a2, a3 = _column(shapes[n], 0, turn), _column(shapes[n], 1, turn), _column(shapes[n], 2, turn)
+        r1, r2, r3 = _cross(a2, a3), _cross(a3, a1), _cross(a1, a2)
+        e0, ex, ey = _times(d, r1, r2, r3), _times(dx, r1, r2, r3), _times(dy, r1, r2, r3)
+        gx, gy = _times(_cross(dx, c), a1, a2, a3), _times(_cross(dy, c), a1, a2, a3)
+        k0, kx, ky = _dot(e0, e0), 2 * _dot(e0, ex), 2 * _dot(e0, ey)
+        kxx, kxy, kyy = (
+            _dot(ex, ex) - _dot(gx, gx),
+            2 * (_dot(ex, ey) - _dot(gx, gy)),
+            _dot(ey, ey) - _dot(gy, gy),
+        )
+        n0, n1, m2 = ky * ky - 4 * kyy * k0, ky * kxy - 2 * kyy * kx, kxy * kxy - 4 * kxx * kyy
+        wide = n1 * n1 - n0 * m2
+        if wide <= 0.0 or m2 >= 0.0:
+            continue
+        middle, half = -n1 / m2, math.sqrt(wide) / -m2
+        chord = 2 * abs(_dot(a1, r1)) * math.sqrt(-kyy)
+        left = column[n] + middle
+        for j in range(max(math.ceil(left - half - 0.5), 0), min(math.floor(left + half + 0.5), columns - 1) + 1):
+            start, stop = _between(j, left, half)
+            for p in range(len(_NODE)):
+                psi = start + _NODE[p] * (stop - start)
+                x, wx = middle + half * math.sin(psi), half * math.cos(psi) * _WEIGHT[p] * (stop - start)
+                # in this column: k0 + kx x + kxx x^2 + (ky + kxy x) y + kyy y^2 = -kyy (high^2 - (y - level)^2)
+                level = (ky + x * kxy) / (-2 * kyy)
+                high = math.sqrt(max(level * level - (k0 + x * (kx + x * kxx)) / kyy, 0.0))
+                top = row[n] + level
+                for i in range(max(math.ceil(top - high - 0.5), 0), min(math.floor(top + high + 0.5), rows - 1) + 1):
+                    first, last = _between(i, top, high)
+                    mean = 0.0
+                    for q in range(len(_NODE)):
+                        phi = first + _NODE[q] * (last - first)
+                        y, across = level + high * math.sin(phi), high * math.cos(phi)
+                        e = (
+                            e0[0] + x * ex[0] + y * ey[0],
+                            e0[1] + x * ex[1] + y * ey[1],
+                            e0[2] + x * ex[2] + y * ey[2],
+                        )
+                        mean += _WEIGHT[q] * across * across / _dot(e, e)
+                    total[i, j] -= wx * chord * (last - first) * mean
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _between(place, middle, half):  # type: ignore[no-untyped-def]
+    """Return the angles, -pi/2 to pi/2, at which middle + half sin(angle) enters and leaves a sub-pixel at a place."""
+    if half == 0.0:
+        return 0.0, 0.0
+    low, high = (place - 0.5 - middle) / half, (place + 0.5 - middle) / half
+    return math.asin(min(max(low, -1.0), 1.0)), math.asin(min(max(high, -1.0), 1.0))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from simulator.crack import NONE, Crack, keep_clear, spheroids
 from simulator.each_point import products
 from simulator.kinematics import Motion, rotation_matrix
 from simulator.microstructure import place
@@ -19,7 +20,8 @@ def rest_body(scenario: Scenario) -> Body:
     """Build the sample in its reference configuration."""
     surface = dog_bone(scenario.specimen)
     half = scenario.specimen.length_mm / 2
-    nodules = place(scenario.graphite, scenario.specimen, stream(scenario, "nodules"), half)
+    placed = place(scenario.graphite, scenario.specimen, stream(scenario, "nodules"), half)
+    nodules = keep_clear(placed, scenario.crack, scenario.graphite.gap_mm)
     return Body(
         vertices_mm=np.asarray(surface.vertices, dtype=np.float64),
         faces=np.asarray(surface.faces, dtype=np.int64),
@@ -28,14 +30,20 @@ def rest_body(scenario: Scenario) -> Body:
     )
 
 
-def moved_body(body: Body, motion: Motion, step: int) -> Body:
-    """Carry the sample along: vertices and centres move, each nodule takes the local affine map."""
+def moved_body(body: Body, motion: Motion, step: int, crack: Crack = NONE) -> Body:
+    """Carry the sample along: vertices and centres move, each nodule and the crack take the local affine map."""
     centres, gradient = motion.carry(body.centres_mm, step)
+    crack_centres, crack_shapes = spheroids(crack, crack.opened_mm(step))
+    if len(crack_centres):
+        crack_centres, crack_gradient = motion.carry(crack_centres, step)
+        crack_shapes = products(crack_gradient, crack_shapes)
     return Body(
         vertices_mm=motion.forward(body.vertices_mm, step),
         faces=body.faces,
         centres_mm=centres,
         shapes_mm=products(gradient, body.shapes_mm),
+        crack_centres_mm=crack_centres,
+        crack_shapes_mm=crack_shapes,
     )
 
 
@@ -50,4 +58,6 @@ def leaning_body(body: Body, lean_rad: float, angle_rad: float) -> Body:
         faces=body.faces,
         centres_mm=body.centres_mm @ matrix.T,
         shapes_mm=matrix @ body.shapes_mm,
+        crack_centres_mm=body.crack_centres_mm @ matrix.T,
+        crack_shapes_mm=matrix @ body.crack_shapes_mm,
     )

@@ -19,13 +19,14 @@ from pydantic import Field, model_validator
 from pdvc.experiment import GeometryEntry, check_held_steps
 from pdvc.geometry import ConeBeam
 from pdvc.settings import Settings, SettingsError
+from simulator.crack import Crack, outline_mm
 from simulator.detector import Detector
 from simulator.ingredients import Drive, MotionOptions
 from simulator.kinematics import Motion
 from simulator.loading import LoadHistory, Loading, load_history
 from simulator.microstructure import Graphite
 from simulator.solver_space import into_sections, time_functions
-from simulator.specimen import Specimen, area_mm2, section_mm
+from simulator.specimen import Specimen, area_mm2, depth_mm, section_mm
 from simulator.xray import XraySource
 
 Floats = NDArray[np.float64]
@@ -149,6 +150,8 @@ class Scenario(Settings):
     """full scans while the test is held"""
     loading: Loading = Loading()
     """the tensile test"""
+    crack: Crack = Crack()
+    """a crack that opens during the test"""
     motion: MotionOptions = MotionOptions()
     """how the sample moves"""
 
@@ -164,7 +167,36 @@ class Scenario(Settings):
                 f"of sight, got {self.specimen.length_mm} mm"
             )
         check_held_steps(self.interrupted.steps, self.acquisition.test_steps, "interrupted.steps")
+        if abs(self.loading.necking_at_mm) > self.specimen.length_mm / 2:
+            raise ValueError(
+                f"loading.necking_at_mm inside the sample, at most {self.specimen.length_mm / 2} mm from its middle, "
+                f"got {self.loading.necking_at_mm} mm"
+            )
+        self._check_steps()
+        self._check_crack()
         return self
+
+    def _check_steps(self) -> None:
+        steps = self.acquisition.test_steps
+        for key, step, happens in (
+            ("crack.first_step", self.crack.first_step, self.crack.opening_mm > 0),
+            ("motion.slip.step", self.motion.slip.step, "slip" in self.motion.ingredients),
+        ):
+            if happens and step >= steps:
+                raise ValueError(f"{key} below {steps}, the number of steps of the test, got {step}")
+
+    def _check_crack(self) -> None:
+        if self.crack.opening_mm == 0:
+            return
+        outline, gap = outline_mm(self.crack), self.graphite.gap_mm
+        lateral = float(depth_mm(self.specimen, outline).min())
+        depth = min(lateral, self.specimen.length_mm / 2 - float(np.abs(outline[:, 2]).max()))
+        if depth < gap:
+            raise ValueError(
+                f"crack.centre_mm and crack.radius_mm of a crack that stays graphite.gap_mm = {gap} mm below the "
+                f"sample's surface, got {list(self.crack.centre_mm)} mm and {self.crack.radius_mm} mm: "
+                + (f"{depth:.3g} mm below it" if depth > 0 else f"{-depth:.3g} mm outside")
+            )
 
     @property
     def view_mm(self) -> float:

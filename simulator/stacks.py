@@ -49,7 +49,7 @@ def image_count(scenario: Scenario, stack: Stack) -> int:
 def clear_images(scanner: Scanner, stack: Stack) -> Callable[[int], Clear]:
     """Return the function that makes an image of a stack without noise, by its number."""
     if stack.step is not None:
-        return partial(_clear_held, scanner, moved_body(scanner.body, scanner.course.motion, stack.step))
+        return partial(_clear_held, scanner, _loaded(scanner, stack.step))
     return partial(clear_view if stack.kind == "reference" else clear_step, scanner)
 
 
@@ -61,9 +61,14 @@ def clear_view(scanner: Scanner, view: int) -> Clear:
 
 def clear_step(scanner: Scanner, step: int) -> Clear:
     """Make one radiograph of the test without noise: share of the open beam (row, column)."""
-    body = moved_body(scanner.body, scanner.course.motion, step)
+    body = _loaded(scanner, step)
     turn = 2 * math.pi / scanner.scenario.acquisition.steps_per_turn
     return clear_image(scanner, body, float(scanner.course.test_angle_rad[step]), turn)
+
+
+def _loaded(scanner: Scanner, step: int) -> Body:
+    """Return the sample at a step of the test."""
+    return moved_body(scanner.body, scanner.course.motion, step, scanner.scenario.crack)
 
 
 def _clear_held(scanner: Scanner, held: Body, view: int) -> Clear:

@@ -25,8 +25,11 @@ ALL = (REFERENCE, TEST, FLATS, DARKS, interrupted_stack(0))
 REST, LOADED, HELD = STACKS = (Stack("reference"), Stack("test"), Stack("interrupted", 12))
 
 
+CRACK = {"opening_mm": 0.2, "centre_mm": [0.1, 0.03, 0.2], "tilt_deg": 5.0, "first_step": 10, "opening_steps": 5}
+
+
 def tiny(**changes):
-    return tinier(interrupted={"steps": [12], "views": 6}, **changes)
+    return tinier(interrupted={"steps": [12], "views": 6}, **{"crack": CRACK, **changes})
 
 
 def stacks(folder):
@@ -82,6 +85,7 @@ def test_what_changes_the_test_alone_shares_the_reference_scan():
         {"motion": {"torsion": {"angle_deg": 1.0}}},
         {"acquisition": {"steps_per_turn": 7}},
         {"loading": {"plateau_steps": 5}},
+        {"crack": {**CRACK, "first_step": 11}},
     ):
         same = {stack: clean_file(tiny(), stack) == clean_file(tiny(**changes), stack) for stack in STACKS}
         assert same == {REST: True, LOADED: False, HELD: False}
@@ -172,7 +176,7 @@ class TestRepetition:
         assert 0 < np.abs(forces[0] - forces[1]).max() < 8
 
     def test_noise_of_two_repetitions_is_independent(self, tmp_path):
-        still = {"motion": {"ingredients": []}, "acquisition": {"steps_per_turn": 20}}
+        still = {"motion": {"ingredients": []}, "acquisition": {"steps_per_turn": 20}, "crack": {}}
         noise = []
         for k in (1, 2):
             simulate(tiny(repetition=k, **still), tmp_path / str(k), clean=tmp_path / "clean")

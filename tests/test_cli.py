@@ -91,7 +91,7 @@ def test_an_unknown_scenario_is_answered_with_those_there_are(tmp_path):
 
 def test_scenarios_are_listed_and_printed_as_toml():
     listed = pdvc_bench("scenarios").stdout
-    for name in ("jailin2018", "quick", "in-space", "rigid"):
+    for name in ("jailin2018", "quick", "in-space", "rigid", "small", "crack", "slip", "neck"):
         assert name in listed
         assert tomllib.loads(pdvc_bench("scenarios", name).stdout)
 

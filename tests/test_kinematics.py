@@ -16,6 +16,7 @@ from simulator.ingredients import (
     MotionOptions,
     Moving,
     Ripple,
+    Slip,
     Torsion,
     Wander,
     Wobble,
@@ -223,6 +224,28 @@ def test_backlash_comes_before_the_test_and_with_the_stroke():
     moved = np.linalg.norm(np.diff(path, axis=0), axis=1)
     np.testing.assert_array_equal(np.flatnonzero(moved > 1e-12), [50, 51, 52])
     np.testing.assert_allclose(path[0], [0.18, 0.03, 0.03])
+
+
+@FEW
+@given(
+    st.integers(0, 140),
+    st.tuples(*[st.floats(-0.5, 0.5)] * 3),
+    st.tuples(*[st.floats(-20.0, 20.0)] * 3),
+    st.integers(0, 126),
+)
+def test_a_slip_is_nothing_before_its_step_and_one_rigid_motion_of_the_deformed_sample_from_it_on(
+    at, shift, turn, step
+):
+    points = material_points()
+    others = ("tension", "bending", "torsion", "compliance", "backlash", "wobble")
+    slip = Slip(step=at, shift_mm=shift, turn_deg=turn)
+    moved = paper_motion(ingredients=(*others, "slip"), slip=slip).forward(points, step)
+    due = paper_motion(ingredients=others[:3]).forward(points, step)
+    if step >= at:
+        # written as a rotation of scipy: another one than that of the code
+        due = Rotation.from_rotvec(turn, degrees=True).apply(due) + shift
+    due = paper_motion(ingredients=others[3:]).forward(due, step)
+    np.testing.assert_allclose(moved, due, atol=1e-12)
 
 
 def test_wobble_stands_still_in_the_lab():

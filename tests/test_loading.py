@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from pdvc.settings import SettingsError
 from simulator.loading import Loading, load_history, strains
 from simulator.specimen import Specimen, area_mm2
+from tests.laws import law
 
 TIME_S = 2.0 * np.arange(127)
 HEIGHT_MM = np.linspace(-6.5, 6.5, 261)
@@ -73,6 +76,22 @@ def test_without_stroke_nothing_happens():
 def test_a_neck_faster_than_the_stroke_is_refused():
     with pytest.raises(ValueError, match=r"loading\.necking_strain: expected .* got 0\.5 over 8 steps"):
         load_history(Loading(necking_strain=0.5), TIME_S, HEIGHT_MM, np.ones(261))
+
+
+@law(40)
+@given(st.floats(-4.0, 4.0), st.floats(0.001, 0.06), st.integers(20, 60), st.floats(0.1, 0.6))
+def test_a_neck_is_a_gaussian_where_it_is_told_and_grows_in_its_steps(at, strain, steps, width):
+    """What a neck adds to the strain of the same force is the neck alone: the law is asked for the rest."""
+    area = area_mm2(Specimen(thinned="both"), HEIGHT_MM)
+    loading = Loading(necking_strain=strain, necking_steps=steps, necking_mm=width, necking_at_mm=at)
+    # lengthens by strain sqrt(2 pi) width, at the end by 2 / steps of that in a step; 0.004 mm is the stroke's
+    assume(strain * np.sqrt(2 * np.pi) * width * 2 / steps < 0.0039)
+    history = load_history(loading, TIME_S, HEIGHT_MM, area)
+    elastic, plastic = strains(loading, history.force_N[:, None] / area)
+    elastic_0, plastic_0 = strains(loading, 250.0 / area)
+    neck = history.strain - (elastic + plastic - elastic_0 - plastic_0)
+    growth = np.clip((np.arange(127) - (126 - steps)) / steps, 0, None)[:, None] ** 2
+    np.testing.assert_allclose(neck, growth * strain * np.exp(-((HEIGHT_MM - at) ** 2) / (2 * width**2)), atol=1e-14)
 
 
 def test_a_wrong_law_is_refused_with_its_key():

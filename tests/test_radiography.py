@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from pdvc.geometry import ConeBeam
 from simulator import radiography
@@ -277,6 +278,113 @@ def test_an_object_that_reaches_the_source_is_refused():
         path_lengths(body(trimesh.creation.box((61.0, 1.0, 1.0))), SCANNER, 0.0, 1)
 
 
+def cracked(centre, shape, mesh=None):
+    return replace(
+        body(mesh), crack_centres_mm=np.array([centre], dtype=float), crack_shapes_mm=np.array([shape], dtype=float)
+    )
+
+
+def air(geometry, angle_rad, subpixels, centre, shape):
+    """Return by how much a crack shortens the path of each sub-pixel."""
+    return -path_lengths(cracked(centre, shape), geometry, angle_rad, subpixels)[0]
+
+
+rotations = st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3).map(
+    lambda r: Rotation.from_rotvec(r).as_matrix()
+)
+
+
+def ball(n=24):
+    """Return points of the unit ball and their weights, exact for polynomials (Gauss, Legendre and the trapezes)."""
+    r, by_r = np.polynomial.legendre.leggauss(n)
+    up, by_up = np.polynomial.legendre.leggauss(n)
+    around = np.arange(2 * n) * np.pi / n
+    r, flat = (r + 1) / 2, np.sqrt(1 - up**2)
+    unit = np.stack(
+        np.broadcast_arrays(flat[:, None] * np.cos(around), flat[:, None] * np.sin(around), up[:, None]), -1
+    )
+    weight = (by_r / 2 * r**2)[:, None, None] * by_up[:, None] * np.full(2 * n, np.pi / n)
+    return (r[:, None, None, None] * unit).reshape(-1, 3), weight.ravel()
+
+
+@law(60)
+@given(rotations, st.floats(-8, 0).map(lambda power: 0.4 * 10**power), points, angles_rad(), st.integers(1, 3))
+def test_no_air_is_lost_between_the_rays_however_flat_a_crack_is(turned, half, centre, angle_rad, subpixels):
+    """Length by solid angle, over all rays, is the integral of 1 / r^2 over the volume, r from the source.
+
+    Half openings from 0.4 mm, a ball, to 4e-9 mm; a sub-pixel is 0.017 to 0.05 mm.
+    """
+    shape, centre = turned @ np.diag([0.4, 0.4, half]), 0.8 * centre
+    lengths = air(SCANNER, angle_rad, subpixels, centre, shape)
+    pitch, distance = SCANNER.pixel_mm / subpixels, SCANNER.source_detector_mm
+    v, u = (pitch * (np.arange(n) - (n - 1) / 2) for n in lengths.shape)
+    solid_angle = pitch**2 * distance / (distance**2 + u**2 + v[:, None] ** 2) ** 1.5
+    source, _ = rays_in_sample_frame(SCANNER, angle_rad, 1)
+    inside, weight = ball()
+    away = inside @ shape.T + centre - source
+    expected = (weight / (away**2).sum(-1)).sum() * 0.16 * half
+    # |d| and the solid angle are those of the middle of a sub-pixel, up to 0.025 mm from the crack: d varies by
+    # 0.025 / 30, and |d|^2 by twice that times its slopes of up to 0.04
+    assert (lengths * solid_angle).sum() == pytest.approx(expected, rel=7e-5)
+
+
+def test_a_crack_between_two_rows_of_rays_is_seen_by_neither_and_shortens_both():
+    """A crack of 1 um in the plane of source and detector centre; a row is 0.05 mm.
+
+    Its closed form: the mean over the two rows beside the plane, in the column on the axis, is the area pi R h of its
+    section over the height of two rows.
+    """
+    scanner = replace(SCANNER, columns=45)
+    flat = np.diag([0.4, 0.4, 5e-4])
+    _, points_miss_it = path_lengths(body(None, [np.zeros(3)], [flat]), scanner, 0.3, 1)
+    assert not points_miss_it.any()
+    lengths = air(scanner, 0.3, 1, np.zeros(3), flat)
+    assert set(np.flatnonzero(lengths.any(axis=1))) == {29, 30}
+    # over a column of 0.05 mm about the middle, the mean of 1 - (x / R)^2 is less than 1 by 0.05^2 / (12 R^2)
+    expected = np.pi * 0.4 * 5e-4 / (2 * 0.05) * (1 - 0.05**2 / 12 / 0.16)
+    np.testing.assert_allclose(lengths[29:31, 22], expected, rtol=1e-4)
+
+
+@law(40)
+@given(cone_beams(), angles_rad(), points, shapes, st.integers(1, 2))
+def test_a_crack_shortens_each_path_by_the_mean_of_chords_over_the_sub_pixel(
+    geometry, angle, centre, shape, subpixels
+):
+    finer = 8
+    _, chords = path_lengths(body(None, [centre], [shape]), geometry, angle, finer * subpixels)
+    rows, columns = geometry.rows * subpixels, geometry.columns * subpixels
+    mean = chords.astype(float).reshape(rows, finer, columns, finer).mean(axis=(1, 3))
+    found = air(geometry, angle, subpixels, centre, shape)
+    # at the rim, where a chord begins as a square root, 8 x 8 points know the mean to a hundredth of the longest chord
+    assert np.abs(found - mean).max() < 0.015 * max(chords.max(), 0.01)
+
+
+@law(40)
+@given(cone_beams(), angles_rad(), points, rotations, st.floats(1e-6, 0.3), st.integers(1, 3))
+def test_a_crack_never_adds_matrix_nor_takes_more_than_its_chord(geometry, angle, centre, turned, half, subpixels):
+    shape = turned @ np.diag([0.4, 0.4, half])
+    mesh = trimesh.creation.box((4.0, 4.0, 4.0))
+    whole, _ = path_lengths(body(mesh), geometry, angle, subpixels)
+    left, graphite = path_lengths(cracked(0.5 * centre, shape, mesh), geometry, angle, subpixels)
+    rounding = 1e-5
+    assert (whole - left).min() >= -rounding
+    # no chord of a spheroid is longer than its longest axis
+    assert (whole - left).max() <= 0.8 + rounding
+    assert left.min() >= -rounding
+    assert not graphite.any()
+
+
+def test_a_crack_partly_beside_the_image_is_cropped():
+    shape = Rotation.from_rotvec([0.3, 0.9, 0.2]).as_matrix() @ np.diag([0.4, 0.4, 0.01])
+    centre = np.array([0.1, 0.2, 0.1])
+    whole = air(SCANNER, 0.4, 2, centre, shape)
+    part = air(SCANNER.cropped(25, 31, 15, 22), 0.4, 2, centre, shape)
+    assert part.any()
+    np.testing.assert_allclose(part, whole[50:62, 30:44], atol=1e-6)
+
+
 def test_a_wrong_shape_is_refused():
     with pytest.raises(ValueError, match=r"body\.shapes_mm: expected shape \(1, 3, 3\)"):
         Body(**NONE, centres_mm=np.zeros((1, 3)), shapes_mm=np.zeros((1, 3)))
+    with pytest.raises(ValueError, match=r"body\.crack_shapes_mm: expected shape \(1, 3, 3\)"):
+        replace(body(), crack_centres_mm=np.zeros((1, 3)))

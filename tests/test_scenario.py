@@ -7,7 +7,7 @@ from pdvc.settings import SettingsError
 from simulator.scenario import Misalignment, Scenario, builtin_names, course_of, load_scenario
 
 
-@pytest.mark.parametrize("name", ["in-space", "jailin2018", "quick", "rigid"])
+@pytest.mark.parametrize("name", ["crack", "in-space", "jailin2018", "neck", "quick", "rigid", "slip", "small"])
 def test_builtin_scenarios_load_and_are_named_after_their_file(name):
     assert name in builtin_names()
     assert load_scenario(name).name == name
@@ -47,6 +47,34 @@ def test_quick_is_the_paper_four_times_coarser():
     assert quick.graphite.mean_diameter_mm == 4 * paper.graphite.mean_diameter_mm
 
 
+@pytest.mark.parametrize("name", ["crack", "neck", "slip"])
+def test_a_fault_is_quick_until_it_begins(name):
+    """The same sample, scanner and force, and the same strain before the step that its file tells."""
+    faulty, quick = load_scenario(name), load_scenario("quick")
+    same = ("seed", "specimen", "graphite", "geometry", "detector", "acquisition", "xray", "discarded_rows")
+    assert all(getattr(faulty, key) == getattr(quick, key) for key in same)
+    due, found = course_of(quick), course_of(faulty)
+    begins = {"crack": 127, "neck": 96, "slip": 127}[name]
+    np.testing.assert_array_equal(found.history.force_N[:begins], due.history.force_N[:begins])
+    np.testing.assert_array_equal(found.history.strain[:begins], due.history.strain[:begins])
+    # the neck of quick itself begins at step 119
+    stray = np.abs(found.history.strain - due.history.strain)[begins:119].max(axis=1)
+    assert np.all(np.diff(stray) > 0)
+    assert stray[-1] > 0.02 if name == "neck" else not len(stray)
+
+
+def test_the_slip_is_where_its_file_tells():
+    due, found = (course_of(load_scenario(name)).motion for name in ("quick", "slip"))
+    points = np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.8], [0.4, 0.2, -3.0]])
+    for step in range(127):
+        stray = found.forward(points, step) - due.forward(points, step)
+        assert stray.any() == (step >= 80)
+        if step >= 80:
+            # 0.05 mm down, and a hundredth of a radian and again about the axis; the tilts of the machine are small
+            np.testing.assert_allclose(stray[0], [0, 0, -0.05], atol=3e-4)
+            np.testing.assert_allclose(stray[2, :2], [-0.02 * 0.2, 0.02 * 0.4], atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -61,6 +89,25 @@ def test_quick_is_the_paper_four_times_coarser():
         ),
         ("[motion.ripple]\nstrain = 1.0", r"motion\.ripple\.strain: expected less than 1, given 1\.0"),
         ('[motion]\ningredients = ["swim"]', r"motion\.ingredients\.0: expected 'tension', .*, given 'swim'"),
+        (
+            '[motion]\ningredients = ["slip"]\n[motion.slip]\nstep = 127',
+            r"expected motion\.slip\.step below 127, the number of steps of the test, got 127",
+        ),
+        ("[motion.slip]\nshift_mm = [1.0]", r"motion\.slip\.shift_mm\.1: missing"),
+        (
+            "[loading]\nnecking_at_mm = -6.6",
+            r"expected loading\.necking_at_mm inside the sample, at most 6\.5 mm from its middle, got -6\.6 mm",
+        ),
+        ("[crack]\nopening_mm = -1.0", r"crack\.opening_mm: expected greater than or equal to 0, given -1\.0"),
+        (
+            "[crack]\nopening_mm = 0.01\nfirst_step = 127",
+            r"expected crack\.first_step below 127, the number of steps of the test, got 127",
+        ),
+        (
+            "[crack]\nopening_mm = 0.01\nradius_mm = 0.5",
+            r"expected crack\.centre_mm and crack\.radius_mm of a crack that stays graphite\.gap_mm = 0\.002 mm below "
+            r"the sample's surface, got \[0\.0, 0\.0, 0\.0\] mm and 0\.5 mm: 0\.045 mm outside",
+        ),
         ("[specimen]\nlength_mm = 5.0", r"expected specimen\.length_mm of at least 10\.\d+ mm"),
         ("discarded_rows = 477", r"discarded_rows below half of the 954 detector rows, got 477"),
         ("[interrupted]\nsteps = [0, 127]", r"expected interrupted\.steps below 127, the number of steps of the test"),
