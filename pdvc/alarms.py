@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc.cells import Cells
+from pdvc.cells import Cells, Spot
 from pdvc.data_checks import AIR_DOUBT, AIR_ERROR, ALIKE, EDGE_SEEN, SATURATED
 from pdvc.examination import StackLook, full_scale, look_at
 from pdvc.incoming import Arrival
@@ -89,6 +89,8 @@ class Watch:
         flats, self._edge = setup.experiment.flats, float(reference.edge.max())
         # a beam without noise, on a detector without pattern, has one count in most pixels
         self._clips = float((flats == flats.max()).mean()) < SATURATED
+        self.spot: Spot | None = None
+        """Where the newest step shows most that is new; None after few steps."""
         self._newest, self._angle_rad = -1, math.nan
         self._before = np.zeros((0, 0), dtype=np.float32)
         self._last: dict[str, int] = {}
@@ -108,20 +110,8 @@ class Watch:
             return ()
         self._newest = line.step
         spot = self._cells.add(taken.residual, taken.amplitude, np.deg2rad(line.angle_deg))
-        found = [*self._of_place(taken), *self._of_motion(taken), *self._of_strain(line)]
-        if self._cells.steps > LEAST_USUAL and spot.score > CRACK:
-            x, y, z = spot.place_mm
-            where = f"x = {x:.2f}, y = {y:.2f}, z = {z:.2f} mm"
-            found.append(
-                Alarm(
-                    name="crack",
-                    value=spot.score,
-                    limit=CRACK,
-                    reason=f"at {where} the residual shows less material than before, by {spot.score:.1f} deviations",
-                    place_mm=spot.place_mm,
-                )
-            )
-        return tuple(found)
+        self.spot = spot if self._cells.steps > LEAST_USUAL else None
+        return (*self._of_place(taken), *self._of_motion(taken), *self._of_strain(line), *self._of_spot())
 
     def new(self, step: int, alarms: tuple[Alarm, ...]) -> tuple[Alarm, ...]:
         """Return those of a step's alarms that did not go on from the steps before."""
@@ -151,6 +141,18 @@ class Watch:
         self._last = dict(zip(kept["names"].tolist(), kept["last"].tolist(), strict=True))
         self._jumps = list(kept["jumps"])
         self._strains = [(strain, deviation) for strain, deviation in kept["strains"]]
+
+    def _of_spot(self) -> Iterator[Alarm]:
+        if self.spot is not None and self.spot.score > CRACK:
+            x, y, z = self.spot.place_mm
+            yield Alarm(
+                name="crack",
+                value=self.spot.score,
+                limit=CRACK,
+                reason=f"at x = {x:.2f}, y = {y:.2f}, z = {z:.2f} mm the residual shows less material than before, by "
+                f"{self.spot.score:.1f} deviations",
+                place_mm=self.spot.place_mm,
+            )
 
     def _of_counts(self, look: StackLook) -> Iterator[Alarm]:
         """Give what is wrong with the counts of a radiograph."""

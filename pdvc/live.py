@@ -226,7 +226,7 @@ class _Follower:
                 self._recall(state)
             self._alarm(arrival.step, self._watch.new(arrival.step, seen))
             return
-        line = _line(self._setup, arrival, taken, time.perf_counter() - started)
+        line = step_line(self._setup, arrival, taken, time.perf_counter() - started)
         alarms = self._watch.new(arrival.step, (*seen, *self._watch.followed(line, taken)))
         self._keep(arrival.step, taken.told, (line, *(alarm.line(arrival.step) for alarm in alarms)))
         self._add(line)
@@ -313,8 +313,8 @@ def _which(line: LostLine) -> tuple[int, str, str]:
 _STATE, _TOLD, _WATCH = "state.kept", ".told.kept", "watch_"
 
 
-def _line(setup: Setup, arrival: Arrival, taken: Taken, seconds: float) -> StepLine:
-    """Return the line of a radiograph that was taken in."""
+def step_line(setup: Setup, arrival: Arrival, taken: Taken, seconds: float) -> StepLine:
+    """Return the line of a radiograph that was taken in, and `seconds` it took."""
     basis, voxel_mm, height = setup.sections, setup.geometry.voxel_mm, setup.sections.height_mm
     points = np.zeros((len(height), 3))
     points[:, 2] = height
