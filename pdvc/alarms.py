@@ -8,9 +8,10 @@
 | stage | likeness to the radiograph before, less that to the reference view at the recorded angle | 0.1, then lost |
 | sudden | a rigid motion that differs from what was expected, over what is usual and what was uncertain | 6 |
 | localisation | a section's strain that grew in `SPAN` steps, beyond its usual share, over its deviation | 5 |
-| crack | residual that is new somewhere on the sample, over its deviation (`pdvc.cells`) | 7 |
+| crack | residual that is new somewhere on the sample, over its deviation (`pdvc.cells`) | 8 |
 
-One that goes on is raised once, and again after `QUIET` steps without it.
+One that goes on is raised again every `QUIET` steps: where a crack is shows the better, the more directions it was
+seen from.
 """
 
 from __future__ import annotations
@@ -25,17 +26,27 @@ from numpy.typing import NDArray
 
 from pdvc.cells import Cells, Spot
 from pdvc.data_checks import AIR_DOUBT, AIR_ERROR, ALIKE, EDGE_SEEN, SATURATED
+from pdvc.deviations import beam_frame
 from pdvc.examination import StackLook, full_scale, look_at
 from pdvc.incoming import Arrival
 from pdvc.likeness import Beside
 from pdvc.record import AlarmLine, StepLine
+from pdvc.sections import (
+    ROTATION_X,
+    ROTATION_Y,
+    ROTATION_Z,
+    TRANSLATION_X,
+    TRANSLATION_Y,
+    TRANSLATION_Z,
+    SectionPattern,
+)
 from pdvc.setup import Setup
 from pdvc.tracker import Taken
 from pdvc.window import height_mm
 
 Floats = NDArray[np.float64]
 
-SUDDEN, LOCAL, CRACK = 6.0, 5.0, 7.0
+SUDDEN, LOCAL, CRACK = 6.0, 5.0, 8.0
 """Limits of what is over its deviation."""
 USUAL = 20
 """Steps that tell what is usual."""
@@ -50,7 +61,7 @@ CERTAIN = 3.0
 TURNED_VOXEL = 4.0
 """Voxels by which the outline turns from a radiograph to the next, for the two to look different."""
 QUIET = 10
-"""Steps without an alarm after which it is raised anew."""
+"""Steps after which an alarm that goes on is raised again."""
 _MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -81,7 +92,7 @@ class Watch:
 
     def __init__(self, setup: Setup) -> None:
         """Begin without a radiograph."""
-        self._setup, self._names = setup, setup.sections.names
+        self._setup = setup
         self._beside = Beside(setup.experiment, setup.calibration)
         self._cells = Cells(setup.geometry.cropped(*setup.window), setup.sections, setup.outline.hull)
         some = np.linspace(0, len(setup.experiment.reference) - 1, 24).astype(int)
@@ -93,7 +104,7 @@ class Watch:
         """Where the newest step shows most that is new; None after few steps."""
         self._newest, self._angle_rad = -1, math.nan
         self._before = np.zeros((0, 0), dtype=np.float32)
-        self._last: dict[str, int] = {}
+        self._raised: dict[str, int] = {}
         self._jumps: list[Floats] = []
         self._strains: list[tuple[Floats, Floats]] = []
 
@@ -111,14 +122,13 @@ class Watch:
         self._newest = line.step
         spot = self._cells.add(taken.residual, taken.amplitude, np.deg2rad(line.angle_deg))
         self.spot = spot if self._cells.steps > LEAST_USUAL else None
-        return (*self._of_place(taken), *self._of_motion(taken), *self._of_strain(line), *self._of_spot())
+        return (*self._of_place(taken), *self._of_motion(line, taken), *self._of_strain(line), *self._of_spot())
 
     def new(self, step: int, alarms: tuple[Alarm, ...]) -> tuple[Alarm, ...]:
-        """Return those of a step's alarms that did not go on from the steps before."""
-        fresh = [alarm for alarm in alarms if step > self._last.get(alarm.name, -QUIET - 1) + QUIET]
-        for alarm in alarms:
-            self._last[alarm.name] = max(step, self._last.get(alarm.name, step))
-        return tuple(fresh)
+        """Return those of a step's alarms that were not raised a few steps ago."""
+        fresh = tuple(alarm for alarm in alarms if abs(step - self._raised.get(alarm.name, -QUIET)) >= QUIET)
+        self._raised.update({alarm.name: step for alarm in fresh})
+        return fresh
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that has to be known to be restored."""
@@ -128,8 +138,8 @@ class Watch:
             "newest": np.array(self._newest),
             "angle": np.array(self._angle_rad),
             "before": self._before,
-            "names": np.array(list(self._last), dtype=str),
-            "last": np.array(list(self._last.values()), dtype=np.int64),
+            "names": np.array(list(self._raised), dtype=str),
+            "raised": np.array(list(self._raised.values()), dtype=np.int64),
             "jumps": np.array(self._jumps).reshape(len(self._jumps), -1),
             "strains": strain,
         }
@@ -138,7 +148,7 @@ class Watch:
         """Know again what it knew when `kept` was asked."""
         self._cells.restore(kept)
         self._newest, self._angle_rad, self._before = int(kept["newest"]), float(kept["angle"]), kept["before"]
-        self._last = dict(zip(kept["names"].tolist(), kept["last"].tolist(), strict=True))
+        self._raised = dict(zip(kept["names"].tolist(), kept["raised"].tolist(), strict=True))
         self._jumps = list(kept["jumps"])
         self._strains = [(strain, deviation) for strain, deviation in kept["strains"]]
 
@@ -216,23 +226,27 @@ class Watch:
                 reason=f"the outermost section is {off:.1f} rows off the detector",
             )
 
-    def _of_motion(self, taken: Taken) -> Iterator[Alarm]:
-        """Compare the rigid motion, the mean over the sections, with what was expected."""
+    def _of_motion(self, line: StepLine, taken: Taken) -> Iterator[Alarm]:
+        """Compare the rigid motion that a radiograph shows, the mean over the sections, with what was expected.
+
+        Along the beam it hardly shows any: there, only what the process is taken for changes suddenly.
+        """
         sections, motions = taken.amplitude.shape
-        mean = np.tile(np.eye(motions), sections) / sections
-        jump = mean @ (taken.amplitude - taken.expected).ravel()
+        seen = _seen(self._setup.sections.names, np.deg2rad(line.angle_deg))
+        shown = np.array(list(seen.values())) @ np.tile(np.eye(motions), sections) / sections
+        jump = shown @ (taken.amplitude - taken.expected).ravel()
         past, self._jumps = self._jumps, [*self._jumps[-USUAL + 1 :], jump]
         if len(past) < LEAST_USUAL:
             return
         usual = _MAD * np.median(np.abs(past), axis=0)
-        score = np.abs(jump) / np.sqrt(usual**2 + np.einsum("mu,uv,mv->m", mean, taken.uncertain, mean))
+        score = np.abs(jump) / np.sqrt(usual**2 + np.einsum("mu,uv,mv->m", shown, taken.uncertain, shown))
         most = int(np.argmax(score))
         if score[most] > SUDDEN:
             yield Alarm(
                 name="sudden",
                 value=float(score[most]),
                 limit=SUDDEN,
-                reason=f"{self._names[most]} changed by {jump[most]:+.2f} voxel against what was expected, "
+                reason=f"{list(seen)[most]}, the sample is {jump[most]:+.2f} voxel from where it was expected, "
                 f"{score[most]:.0f} deviations of what is usual",
             )
 
@@ -263,3 +277,19 @@ class Watch:
                 f"part is {100 * share * before[most]:.2f} %",
                 place_mm=(math.nan, math.nan, place),
             )
+
+
+def _seen(names: tuple[str, ...], angle_rad: float) -> dict[str, Floats]:
+    """Return the rigid motions of a section that a radiograph shows, as shares of its motions (motion,)."""
+    across, _, along = beam_frame(angle_rad)
+    shares: dict[str, dict[SectionPattern, float]] = {
+        "across the beam": {TRANSLATION_X: across[0], TRANSLATION_Y: across[1]},
+        "vertically": {TRANSLATION_Z: 1.0},
+        "by rotation about the beam": {ROTATION_X: along[0], ROTATION_Y: along[1]},
+        "by rotation about the axis": {ROTATION_Z: 1.0},
+    }
+    found = {
+        direction: np.array([{each.name: share for each, share in parts.items()}.get(name, 0.0) for name in names])
+        for direction, parts in shares.items()
+    }
+    return {direction: share for direction, share in found.items() if share.any()}

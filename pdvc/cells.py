@@ -6,9 +6,11 @@ what was seen there,
 
     m_t(X) = (1 - a) m_(t-1)(X) + a w_t(p_t(X))
 
-is taken over the last few steps, and with a smaller a over many. Rays cross many cells, so that a spot in one residual
-may lie anywhere along its ray; those of several directions meet where it is. What the model of the image always misses
-there is in both means: the difference of the two, over its own deviation over all cells, tells what is new.
+is taken over the last few steps, and with a smaller a over many. What the model of the image always misses there is in
+both: their difference, over its own deviation over all cells, tells what is new.
+
+Rays cross many cells, so that a spot in one residual may lie anywhere along its ray; those of several directions meet
+where it is. Its place is therefore the middle of where much is new over some more steps, at the height of the spot.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ LEAST_VOXEL = 4
 """Voxels along the side of a cell, at least."""
 MOST_CELLS = 30_000
 """Cells of a sample, about, at most."""
-SOON, LATE = 1 / 3, 1 / 30
-"""Share of a step in the mean over few steps, and over many."""
+SOON, PLACED, LATE = 1 / 3, 1 / 12, 1 / 30
+"""Share of a step in the mean over few steps, over as many as tell a place, and over many."""
 USED_SHARE = 0.3
 """Share of a square of pixels that is used, at least, to count."""
 _MAD = 1.4826
@@ -48,7 +50,7 @@ class Spot:
     score: float
     """What is new there, over its deviation over all cells."""
     place_mm: tuple[float, float, float]
-    """The middle of the cell (x, y, z), on the sample as it was at rest."""
+    """Its middle (x, y, z), on the sample as it was at rest; across the beam it is known first."""
 
 
 class Cells:
@@ -70,7 +72,7 @@ class Cells:
         self._xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
         slab = np.clip(((self._z - hull.z_mm) / hull.slab_mm).astype(int), 0, len(hull.support_mm) - 1)
         self._inside = ((self._xy @ hull.normals().T) <= hull.support_mm[slab][:, None]).all(axis=-1)
-        self._soon, self._late = np.zeros(self._inside.shape), np.zeros(self._inside.shape)
+        self._means = np.zeros((3, *self._inside.shape))
         self.steps = 0
         """Steps so far."""
 
@@ -79,25 +81,26 @@ class Cells:
         seen, (row, column) = self._summed(residual), self._places(amplitude, angle_rad)
         on = self._inside & (row >= 0) & (column >= 0) & (row < seen.shape[0]) & (column < seen.shape[1])
         new = np.where(on, seen[np.where(on, row, 0), np.where(on, column, 0)], 0.0)
-        self._soon += max(SOON, 1 / (self.steps + 1)) * (new - self._soon)
-        difference = (self._soon - self._late)[self._inside]
-        most = int(np.argmax(difference))
-        scale = _MAD * float(np.median(np.abs(difference)))
-        layer, cell = (int(each[most]) for each in np.nonzero(self._inside))
-        self._late += max(LATE, 1 / (self.steps + 1)) * (self._soon - self._late)
+        self._means[:2] += np.maximum([[[SOON]], [[PLACED]]], 1 / (self.steps + 1)) * (new - self._means[:2])
+        soon, placed = self._means[:2] - self._means[2]
+        scale = _MAD * float(np.median(np.abs(soon[self._inside])))
+        most = np.unravel_index(int(np.argmax(np.where(self._inside, soon, -np.inf))), soon.shape)
+        score = float(soon[most]) / scale if scale > 0 else 0.0
+        self._means[2] += max(LATE, 1 / (self.steps + 1)) * (new - self._means[2])
         self.steps += 1
-        x, y = self._xy[cell].tolist()
-        return Spot(
-            score=float(difference[most]) / scale if scale > 0 else 0.0, place_mm=(x, y, float(self._z[layer]))
-        )
+        layer = int(most[0])
+        weight = np.where(self._inside[layer], placed[layer], 0)
+        weight = np.maximum(weight - weight.max() / 2, 0)
+        x, y = (self._xy.T @ weight / weight.sum() if weight.any() else self._xy[most[1]]).tolist()
+        return Spot(score=score, place_mm=(x, y, float(self._z[layer])))
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that has to be known to be restored."""
-        return {"soon": self._soon, "late": self._late, "steps": np.array(self.steps)}
+        return {"means": self._means, "steps": np.array(self.steps)}
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
         """Know again what it knew when `kept` was asked."""
-        self._soon, self._late, self.steps = kept["soon"].copy(), kept["late"].copy(), int(kept["steps"])
+        self._means, self.steps = kept["means"].copy(), int(kept["steps"])
 
     def _summed(self, residual: Image) -> Floats:
         """Return w_t (row, column); zero where too little is used."""

@@ -37,7 +37,7 @@ FITTED = 64
 """Steps from which deviations are fitted, at most."""
 EVERY = 16
 """Steps after which deviations are fitted anew."""
-MEANWHILE = 2
+MEANWHILE = 3
 """Steps that go on while deviations are fitted, which takes as long as some of them."""
 CHANGED = 0.1
 """Change of a step's scales, of their logarithm, from which on the filter goes over it again."""
@@ -113,6 +113,8 @@ class LaggedFilter:
 
     def expected(self, step: int) -> Expected:
         """Return what is expected of a step; raises Late where it is more than `LAG` steps ago."""
+        # by what it is to be taken in with
+        self._take_over(max(self.steps, step + 1))
         mean, covariance = self._after(step).ahead()
         return Expected(step=step, mean=mean[:, 0], covariance=covariance)
 
@@ -137,12 +139,7 @@ class LaggedFilter:
         self._told[step] = told
         self._passed = self._passed[: step - self._first + 1]
         self.steps = max(self.steps, step + 1)
-        if self._fit is not None and self.steps >= self._fitted + MEANWHILE:
-            found = self._fit.found.result()
-            # the ends of a window are not those of the test
-            shared = {name: getattr(found, name) for name in ("bend_voxel", "roughness", "apparent_voxel")}
-            self._adopt(replace(self._deviations, **shared))
-            self._fit = None
+        self._take_over(self.steps)
         if self._finds:
             window = slice(max(self.steps - WINDOW, 0), self.steps)
             process, given = self._process(window, self._about()), self._given(window)
@@ -172,6 +169,15 @@ class LaggedFilter:
             self._fitted = self.steps
             window = slice(max(self.steps - FITTED, 0), self.steps)
             self._fit = self._begun(window, self._about(), self._given(window))
+
+    def _take_over(self, steps: int) -> None:
+        """Wait for deviations that are being fitted, and take them over, where so many steps have come."""
+        if self._fit is not None and steps >= self._fitted + MEANWHILE:
+            found = self._fit.found.result()
+            # the ends of a window are not those of the test
+            shared = {name: getattr(found, name) for name in ("bend_voxel", "roughness", "apparent_voxel")}
+            self._adopt(replace(self._deviations, **shared))
+            self._fit = None
 
     def _begun(self, window: slice, about: Floats, given: Deviations) -> _Fit:
         found = self._thread.submit(self._process(window, about).fitted, given, 1)
