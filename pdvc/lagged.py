@@ -134,8 +134,7 @@ class LaggedFilter:
 
     def add(self, step: int, told: Told) -> None:
         """Take in what the radiograph of a step told; raises Late where it is more than `LAG` steps ago."""
-        # up to what was known before it
-        self._after(step)
+        expected = self.expected(step)
         self._told[step] = told
         self._passed = self._passed[: step - self._first + 1]
         self.steps = max(self.steps, step + 1)
@@ -143,8 +142,13 @@ class LaggedFilter:
         if self._finds:
             window = slice(max(self.steps - WINDOW, 0), self.steps)
             process, given = self._process(window, self._about()), self._given(window)
-            # nothing was known of a step before its radiograph
+            # nothing was known of a step before its radiograph; one that is far off has slipped rather than misfits
             given.misfit[step - window.start] = 1
+            if step + 1 == self.steps and step - window.start >= 2:
+                last = step - window.start - 2
+                information, vector = self._informed(step, misfit=1.0)
+                found = self._scales(expected, information, vector[:, 0] - information @ expected.mean)
+                given.rigid_scale[last], given.own_scale[last] = found.rigid_scale[0], found.own_scale[0]
             self._adopt(_with_scales(self._deviations, process.rescaled(given), window))
         self._after(self.steps)
         self._passed = self._passed[max(self.steps - 1 - LAG - self._first, 0) :]
@@ -236,12 +240,15 @@ class LaggedFilter:
             self._passed.append(known)
         return self._passed[step - self._first]
 
-    def _informed(self, step: int) -> tuple[Floats, Floats]:
-        """Return J' (state, state) and v' (state, 1 + error) of a step; zeros where there is no radiograph."""
+    def _informed(self, step: int, misfit: float | None = None) -> tuple[Floats, Floats]:
+        """Return J' (state, state) and v' (state, 1 + error) of a step; zeros where there is no radiograph.
+
+        For the misfit that is known of it, unless another is given.
+        """
         states = self.space.shape[1]
         if step not in self._told:
             return np.zeros((states, states)), np.zeros((states, self._passed[0].errors + 1))
-        told, misfit = self._told[step], self._variances.misfit[step]
+        told, misfit = self._told[step], self._variances.misfit[step] if misfit is None else misfit
         design = told.design @ self.space.to_amplitude
         vectors = design.T @ np.column_stack([told.data, told.errors]) / misfit
         apparent = self._variances.apparent[step]
@@ -263,11 +270,17 @@ class LaggedFilter:
 
         From J' and v' - J' x_p. The first two steps end no bend.
         """
-        space, bend = self.space, expected.step - 2
+        bend = expected.step - 2
         if bend < 0:
             return np.zeros(len(left))
-        three = slice(bend, bend + 3)
-        space, deviations = space.within(three), _within(self._deviations, three)
+        space = self.space.within(slice(bend, bend + 3))
+        deviations = self._scales(expected, information, left)
+        return np.asarray(space.bend_variance(deviations)[0] / space.second_differences[0, 2] ** 2)
+
+    def _scales(self, expected: Expected, information: Floats, left: Floats) -> Deviations:
+        """Return the deviations of the three steps that a step's bend joins, its scales as large as the step shows."""
+        three = slice(expected.step - 2, expected.step + 1)
+        space, deviations = self.space.within(three), _within(self._deviations, three)
         factor, once = space.second_differences[0, 2], space.bend_variance(unscaled(deviations))
         if self._finds:
             both = np.column_stack([information, left])
@@ -277,7 +290,7 @@ class LaggedFilter:
                 covariance = np.linalg.inv(matrix + np.diag(1 / space.bend_variance(deviations)[0]))
                 squares = (covariance @ vector) ** 2 + np.diag(covariance)
                 deviations = replace(deviations, **bend_scales(space, squares / once))
-        return np.asarray(space.bend_variance(deviations)[0] / factor**2)
+        return deviations
 
     def _about(self) -> Floats:
         """Return amplitudes (unknown,) about which those of the first step of a window may be."""
