@@ -7,7 +7,7 @@
 | out-of-view | share of rows in which the sample covers a side of the detector, or a section that is off it | 0.02 |
 | stage | likeness to the radiograph before, less that to the reference view at the recorded angle | 0.1, then lost |
 | sudden | a rigid motion that differs from what was expected, over what is usual and what was uncertain | 6 |
-| localisation | a section's strain that grew in `SPAN` steps, beyond its usual share, over its deviation | 5 |
+| localisation | growth of strain in a section beyond its part of that of all, over how far sections usually are | 8 |
 | crack | residual that is new somewhere on the sample, over its deviation (`pdvc.cells`) | 8 |
 
 One that goes on is raised again every `QUIET` steps: where a crack is shows the better, the more directions it was
@@ -46,14 +46,14 @@ from pdvc.window import height_mm
 
 Floats = NDArray[np.float64]
 
-SUDDEN, LOCAL, CRACK = 6.0, 5.0, 8.0
+SUDDEN, LOCAL, CRACK = 6.0, 8.0, 8.0
 """Limits of what is over its deviation."""
 USUAL = 20
 """Steps that tell what is usual."""
 LEAST_USUAL = 8
 """The same, at least: before that nothing is unusual."""
-SPAN = 8
-"""Steps over which strain grows, to be compared with as many before."""
+SPAN, BEFORE = 8, 2
+"""Steps over which strain grows, and how many times as many before it is compared with."""
 LOCAL_SHARE = 0.5
 """Share by which a section's strain grew more than was its part, at least."""
 CERTAIN = 3.0
@@ -106,7 +106,7 @@ class Watch:
         self._before = np.zeros((0, 0), dtype=np.float32)
         self._raised: dict[str, int] = {}
         self._jumps: list[Floats] = []
-        self._strains: list[tuple[Floats, Floats]] = []
+        self._strains: list[Floats] = []
 
     def seen(self, radiograph: Arrival) -> tuple[Alarm, ...]:
         """Look at a radiograph before anything is measured on it; return all that is wrong with it."""
@@ -132,7 +132,6 @@ class Watch:
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that has to be known to be restored."""
-        strain = np.array(self._strains).reshape(len(self._strains), 2, -1)
         return {
             **self._cells.kept(),
             "newest": np.array(self._newest),
@@ -141,7 +140,7 @@ class Watch:
             "names": np.array(list(self._raised), dtype=str),
             "raised": np.array(list(self._raised.values()), dtype=np.int64),
             "jumps": np.array(self._jumps).reshape(len(self._jumps), -1),
-            "strains": strain,
+            "strains": np.array(self._strains).reshape(len(self._strains), 2, -1),
         }
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
@@ -150,7 +149,7 @@ class Watch:
         self._newest, self._angle_rad, self._before = int(kept["newest"]), float(kept["angle"]), kept["before"]
         self._raised = dict(zip(kept["names"].tolist(), kept["raised"].tolist(), strict=True))
         self._jumps = list(kept["jumps"])
-        self._strains = [(strain, deviation) for strain, deviation in kept["strains"]]
+        self._strains = list(kept["strains"])
 
     def _of_spot(self) -> Iterator[Alarm]:
         if self.spot is not None and self.spot.score > CRACK:
@@ -251,22 +250,26 @@ class Watch:
             )
 
     def _of_strain(self, line: StepLine) -> Iterator[Alarm]:
-        """Compare how strain grew, section by section, with how it grew before."""
-        self._strains = [*self._strains[-2 * SPAN :], (np.array(line.strain), np.array(line.strain_std))]
-        if len(self._strains) <= 2 * SPAN or not line.strain:
+        """Compare how strain grew, section by section, with how it grew before.
+
+        Its part of the growth of all is what a section has after its part before. How far sections usually are from
+        that is seen in all of them: where the whole ligament yields, no section leaves the others.
+        """
+        kept = (1 + BEFORE) * SPAN + 1
+        self._strains = [*self._strains[1 - kept :], np.stack([line.strain, line.strain_std])]
+        if len(self._strains) < kept or not line.strain:
             return
-        (first, _), (middle, between), (last, now) = (self._strains[k] for k in (0, SPAN, 2 * SPAN))
+        (first, _), (middle, between), (last, now) = (self._strains[k] for k in (0, BEFORE * SPAN, -1))
         before, grown = middle - first, last - middle
         # errors of neighbouring steps are alike: this is more than that of their difference
-        variance = now**2 + between**2
-        certain = CERTAIN * math.sqrt(float(variance.sum()))
+        certain = CERTAIN * math.sqrt(float((now**2 + between**2).sum()))
         if before.sum() < certain or grown.sum() < certain:
             return
-        share = float(grown.sum() / before.sum())
-        excess = grown - share * before
-        score = excess / np.sqrt(variance * (1 + share**2))
-        most = int(np.argmax(score))
-        if score[most] > LOCAL and excess[most] > LOCAL_SHARE * abs(share * before[most]):
+        part = before * grown.sum() / before.sum()
+        excess = grown - part
+        score = excess / max(_MAD * float(np.median(np.abs(excess - np.median(excess)))), 1e-300)
+        most = int(np.argmax(excess))
+        if score[most] > LOCAL and excess[most] > LOCAL_SHARE * max(part[most], grown.mean()):
             height = self._setup.sections.height_mm
             place = float(height[most : most + 2].mean())
             yield Alarm(
@@ -274,7 +277,7 @@ class Watch:
                 value=float(score[most]),
                 limit=LOCAL,
                 reason=f"at z = {place:.2f} mm strain grew by {100 * grown[most]:.2f} % in {SPAN} steps, where its "
-                f"part is {100 * share * before[most]:.2f} %",
+                f"part is {100 * part[most]:.2f} %",
                 place_mm=(math.nan, math.nan, place),
             )
 

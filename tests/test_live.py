@@ -18,7 +18,7 @@ from pdvc.incoming import IncomingWriter
 from pdvc.live import follow, make_ready, record_of
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.protocol import measure
-from pdvc.record import Line, LostLine, MeasurementLine, PlanLine, StepLine, read_record
+from pdvc.record import AlarmLine, Line, LostLine, MeasurementLine, PlanLine, StepLine, read_record
 from simulator.scanner import simulate
 from simulator.scenario import Scenario, course_of
 from tests.command_line import pdvc_bench
@@ -76,12 +76,20 @@ def motions(lines) -> list[StepLine]:
     return [replace(line, seconds=0.0, unix_s=0.0) for line in lines if isinstance(line, StepLine)]
 
 
+def alarms(lines) -> list[AlarmLine]:
+    """Return the alarms of a record."""
+    return [line for line in lines if isinstance(line, AlarmLine)]
+
+
 def test_there_is_a_line_for_the_plan_for_each_radiograph_in_turn_and_for_the_measurement(followed, planned):
     lines, _ = followed
     assert isinstance(lines[0], PlanLine)
     assert lines[0].steps == STEPS
-    assert [line.step for line in lines[1:-1]] == list(range(STEPS))
-    np.testing.assert_allclose([np.deg2rad(line.angle_deg) for line in lines[1:-1]], planned.test.angle_rad)
+    steps = motions(lines)
+    assert [line.step for line in steps] == list(range(STEPS))
+    np.testing.assert_allclose([np.deg2rad(line.angle_deg) for line in steps], planned.test.angle_rad)
+    # loading begins
+    assert (alarms(lines)[0].step, alarms(lines)[0].alarm) == (11, "sudden")
     assert isinstance(lines[-1], MeasurementLine)
 
 
@@ -147,14 +155,18 @@ def test_killed_anywhere_it_goes_on_to_the_same_numbers(
 
         return write_arrays
 
-    def kill_after(line):
-        lines.append(line)
-        # before the deviations are fitted
-        if isinstance(line, StepLine) and line.step == 15:
-            raise Killed
+    def kill_after(step: int):
+        def tell(line):
+            lines.append(line)
+            if isinstance(line, StepLine) and line.step == step:
+                raise Killed
 
-    # before what a radiograph told is kept, before what the tracker knows, and after its line
-    for write, tell in ((7, lines.append), (2, lines.append), (0, kill_after)):
+        return tell
+
+    # before what a radiograph told is kept, before what the tracker knows, after its line and before its alarm, and
+    # before and while deviations are fitted
+    kills = ((7, lines.append), (2, lines.append), *((0, kill_after(step)) for step in (11, 15, 16, 17)))
+    for write, tell in kills:
         writes = 0
         monkeypatch.setattr(live, "write_arrays", killed_at(write))
         with pytest.raises(Killed):
@@ -163,7 +175,25 @@ def test_killed_anywhere_it_goes_on_to_the_same_numbers(
     record = record_of(file)
     record.write_bytes(record.read_bytes()[:-40])
     follow_to_its_end(planned, arriving, file, work=ready)
-    assert motions(read_record(record)) == motions(followed[0])
+    found = list(read_record(record))
+    assert motions(found) == motions(followed[0])
+    assert alarms(found) == alarms(followed[0])
+
+
+def test_radiographs_without_a_beam_raise_one_alarm_and_are_left_out_to_the_end(
+    folder, planned, ready, followed, tmp_path
+):
+    arriving, file = played(folder, tmp_path / "arriving", range(14)), tmp_path / "motion.nc"
+    dark = np.rint(np.mean(planned.darks, axis=0)).astype(np.uint16)
+    for step in (8, 9):
+        tifffile.imwrite(arriving / f"{step:05d}.tif", dark)
+    found = follow(planned, arriving, file, work=ready, idle_s=0.2)
+    lines = list(read_record(record_of(file)))
+    assert [(line.step, line.alarm) for line in alarms(lines) if line.alarm == "beam"] == [(8, "beam")]
+    assert [line.step for line in lines if isinstance(line, LostLine)] == [8, 9]
+    assert found.recording.steps == 12
+    # they are as if they had not come
+    assert motions(lines)[:8] == motions(followed[0])[:8]
 
 
 def test_what_cannot_be_used_is_said_once_and_the_others_are_followed(

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pdvc.record import LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
+from pdvc.record import AlarmLine, LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
 from tests.laws import law
 
 numbers = st.floats(-1e6, 1e6)
@@ -27,7 +27,12 @@ lines = st.one_of(
         **dict.fromkeys(("strain", "strain_std"), several),
         **dict.fromkeys(SINGLE, numbers),
     ),
-    st.builds(LostLine, step=st.integers(-1), file=st.text(), reason=st.text()),
+    st.builds(LostLine, step=st.integers(-1), file=st.text(), reason=st.text(), whole_test=st.booleans()),
+    st.builds(
+        AlarmLine,
+        step=st.integers(0), alarm=st.text(), value=numbers, limit=numbers, reason=st.text(),
+        place_mm=st.tuples(numbers, numbers, numbers),
+    ),
     st.builds(MeasurementLine, file=st.text(), seconds=numbers),
 )
 
@@ -56,7 +61,10 @@ def test_what_is_cut_anywhere_is_gone_on_with_after_its_last_whole_line(tmp_path
 def test_a_line_is_one_line_of_json_that_says_what_it_is():
     line = LostLine(step=3, file="a.tif", reason="cut\nshort")
     assert "\n" not in line.text()
-    assert json.loads(line.text()) == {"what": "lost", "step": 3, "file": "a.tif", "reason": "cut\nshort"}
+    assert json.loads(line.text()) == {
+        "what": "lost", "step": 3, "file": "a.tif",
+        "reason": "cut\nshort", "whole_test": False,
+    }
 
 
 def test_what_is_not_finite_is_null_which_every_reader_knows(tmp_path):
