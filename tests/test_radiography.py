@@ -276,6 +276,8 @@ def test_threads_do_not_change_a_bit():
 def test_an_object_that_reaches_the_source_is_refused():
     with pytest.raises(ValueError, match="body: expected between source and detector"):
         path_lengths(body(trimesh.creation.box((61.0, 1.0, 1.0))), SCANNER, 0.0, 1)
+    with pytest.raises(ValueError, match="body: expected between source and detector"):
+        path_lengths(cracked([-31.0, 0.0, 0.0], np.eye(3)), SCANNER, 0.0, 1)
 
 
 def cracked(centre, shape, mesh=None):
