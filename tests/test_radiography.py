@@ -316,7 +316,8 @@ def test_no_air_is_lost_between_the_rays_however_flat_a_crack_is(turned, half, c
 
     Half openings from 0.4 mm, a ball, to 4e-9 mm; a sub-pixel is 0.017 to 0.05 mm.
     """
-    shape, centre = turned @ np.diag([0.4, 0.4, half]), 0.8 * centre
+    # wholly in the image, which ends 1.1 mm from the axis
+    shape, centre = turned @ np.diag([0.4, 0.4, half]), 0.5 * centre
     lengths = air(SCANNER, angle_rad, subpixels, centre, shape)
     pitch, distance = SCANNER.pixel_mm / subpixels, SCANNER.source_detector_mm
     v, u = (pitch * (np.arange(n) - (n - 1) / 2) for n in lengths.shape)
