@@ -276,6 +276,8 @@ def test_threads_do_not_change_a_bit():
 def test_an_object_that_reaches_the_source_is_refused():
     with pytest.raises(ValueError, match="body: expected between source and detector"):
         path_lengths(body(trimesh.creation.box((61.0, 1.0, 1.0))), SCANNER, 0.0, 1)
+    with pytest.raises(ValueError, match="body: expected between source and detector"):
+        path_lengths(cracked([-31.0, 0.0, 0.0], np.eye(3)), SCANNER, 0.0, 1)
 
 
 def cracked(centre, shape, mesh=None):
@@ -314,7 +316,8 @@ def test_no_air_is_lost_between_the_rays_however_flat_a_crack_is(turned, half, c
 
     Half openings from 0.4 mm, a ball, to 4e-9 mm; a sub-pixel is 0.017 to 0.05 mm.
     """
-    shape, centre = turned @ np.diag([0.4, 0.4, half]), 0.8 * centre
+    # wholly in the image, which ends 1.1 mm from the axis
+    shape, centre = turned @ np.diag([0.4, 0.4, half]), 0.5 * centre
     lengths = air(SCANNER, angle_rad, subpixels, centre, shape)
     pitch, distance = SCANNER.pixel_mm / subpixels, SCANNER.source_detector_mm
     v, u = (pitch * (np.arange(n) - (n - 1) / 2) for n in lengths.shape)
