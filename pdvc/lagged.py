@@ -35,8 +35,8 @@ LAG = 20
 """Steps that the filter goes over again."""
 FITTED = 64
 """Steps from which deviations are fitted, at most."""
-EVERY = 16
-"""Steps after which deviations are fitted anew."""
+FIRST, EVERY = 32, 16
+"""Steps after which deviations are fitted first, and anew: from fewer they are anything."""
 MEANWHILE = 3
 """Steps that go on while deviations are fitted, which takes as long as some of them."""
 CHANGED = 0.1
@@ -132,8 +132,12 @@ class LaggedFilter:
         gain = np.linalg.solve(np.eye(len(spread)) + spread @ information, spread)
         return to @ (expected.mean + gain @ left), to @ gain @ to.T
 
-    def add(self, step: int, told: Told) -> None:
-        """Take in what the radiograph of a step told; raises Late where it is more than `LAG` steps ago."""
+    def add(self, step: int, told: Told, *, slips: bool = True) -> None:
+        """Take in what the radiograph of a step told; raises Late where it is more than `LAG` steps ago.
+
+        `slips`: whether what is far from what was expected is a motion at once. The steps after it tell, otherwise,
+        whether it was one, or what the model of the image misses.
+        """
         expected = self.expected(step)
         self._told[step] = told
         self._passed = self._passed[: step - self._first + 1]
@@ -142,9 +146,9 @@ class LaggedFilter:
         if self._finds:
             window = slice(max(self.steps - WINDOW, 0), self.steps)
             process, given = self._process(window, self._about()), self._given(window)
-            # nothing was known of a step before its radiograph; one that is far off has slipped rather than misfits
+            # nothing was known of a step before its radiograph
             given.misfit[step - window.start] = 1
-            if step + 1 == self.steps and step - window.start >= 2:
+            if slips and step + 1 == self.steps and step - window.start >= 2:
                 last = step - window.start - 2
                 information, vector = self._informed(step, misfit=1.0)
                 found = self._scales(expected, information, vector[:, 0] - information @ expected.mean)
@@ -169,7 +173,7 @@ class LaggedFilter:
         They are taken over `MEANWHILE` steps later, when they are ready or waited for: what comes out does not depend
         on the clock.
         """
-        if self._finds and self._fit is None and self.steps >= self._fitted + EVERY:
+        if self._finds and self._fit is None and self.steps >= max(self._fitted + EVERY, FIRST):
             self._fitted = self.steps
             window = slice(max(self.steps - FITTED, 0), self.steps)
             self._fit = self._begun(window, self._about(), self._given(window))

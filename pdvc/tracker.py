@@ -61,6 +61,10 @@ Image = NDArray[np.float32]
 
 DRAWS = 32
 """Draws of white noise that go along."""
+USUAL, LEAST_USUAL = 20, 5
+"""Steps that tell which residual is usual, and as many as there have to be."""
+EXPLAINED = 1.2
+"""Rms residual over the usual one, up to which the motion explains a radiograph: what is far off then has moved."""
 AWAITED_VOXEL = 1.0
 """Rms distance of the motion from the expected one, up to which V is that of the expected one."""
 AWAITED_RAD = 2e-3
@@ -142,6 +146,7 @@ class Tracker:
         blocks = len(_larger_blocks(-(-rows // BAND_ROWS), -(-columns // BLOCK_COLUMNS)).T)
         self._known = LaggedFilter(space, few, solver.bend_voxel, 1 + DRAWS + blocks)
         self._awaited: _Awaited | None = None
+        self._rms: list[float] = []
 
     def take(self, radiograph: Arrival) -> Taken:
         """Take in a radiograph; raises Late of `pdvc.lagged` where its step is too far behind the newest."""
@@ -157,12 +162,18 @@ class Tracker:
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that has to be known to be restored, but for what the steps `told` told."""
-        return {**self._known.kept(), "pattern": self._pattern.sums, "pattern_steps": np.array(self._pattern.steps)}
+        return {
+            **self._known.kept(),
+            "pattern": self._pattern.sums,
+            "pattern_steps": np.array(self._pattern.steps),
+            "rms": np.array(self._rms),
+        }
 
     def restore(self, kept: Mapping[str, NDArray[Any]], told: Mapping[int, Told]) -> None:
         """Know again what it knew when `kept` was asked, with what steps told since."""
         self._known.restore(kept, told)
         self._pattern.sums, self._pattern.steps = np.array(kept["pattern"]), int(kept["pattern_steps"])
+        self._rms = kept["rms"].tolist()
 
     def _take(self, radiograph: Arrival) -> Taken:
         pattern = self._pattern.found() if self._setup.options.remove_pattern else None
@@ -179,7 +190,10 @@ class Tracker:
         if self._awaited is None or not self._awaited.fits(radiograph, amplitude):
             self._awaited = self._meeting(fine, amplitude, noise, radiograph)
         told = self._told_by(self._awaited, amplitude, equations, noise.step(0))
-        self._known.add(radiograph.step, told)
+        rms = equations.rms
+        usual = float(np.median(self._rms)) if len(self._rms) >= LEAST_USUAL else 0.0
+        self._known.add(radiograph.step, told, slips=rms < EXPLAINED * usual)
+        self._rms = [*self._rms[1 - USUAL :], rms]
         found, covariance = self._known.at(radiograph.step)
         if pattern is not None:
             self._pattern.add(equations.residual[0], pattern.grey[fine.systematic.window], noise.step(0))

@@ -75,7 +75,7 @@ def test_a_spot_that_comes_up_is_found_where_it_is_on_the_sample(radius, directi
     amplitude[:, :3] = moved_voxel
     cells, shift = Cells(GEOMETRY, BASIS, HULL), np.array(moved_voxel) * GEOMETRY.voxel_mm
     before = 0.0
-    for t, image in residuals(54, seed, place, since=30, height=3.0, shift_mm=shift):
+    for t, image in residuals(54, seed, place, since=30, height=5.0, shift_mm=shift):
         spot = cells.add(image, amplitude, t * STEP_RAD)
         before = max(before, spot.score) if LEAST_USUAL < t < 30 else before
     assert before < 8 < spot.score
@@ -187,7 +187,9 @@ def motion(setup: Setup, step: int, *, jump=(0.0,) * 7, strain=None) -> tuple[St
         uncertain=1e-6 * np.eye(sections * motions),
         told=None,
         residual=np.zeros((119, 54), dtype=np.float32),
-        tests=ResidualTests(1.0, 0.0, 0.0, 0.0, 0.0),
+        tests=ResidualTests(
+            chi2_reduced=1.0, lag1_row=0.0, lag1_column=0.0, lag1_row_expected=0.0, lag1_column_expected=0.0
+        ),
         passes=4,
     )
     return line, taken

@@ -126,9 +126,9 @@ def test_a_pass_is_weighed_against_what_is_expected_as_two_gaussians_are(seed, s
     np.testing.assert_allclose(covariance, together, atol=1e-5 * np.abs(covariance).max())
 
 
-@pytest.mark.parametrize("killed", [1, 6, 12, 17, 24])
+@pytest.mark.parametrize("killed", [1, 6, 7, 8, 12, 17, 24])
 def test_gone_on_with_it_finds_the_same_to_the_last_digit(killed, monkeypatch):
-    for name, value in (("LAG", 4), ("WINDOW", 8), ("FITTED", 12), ("EVERY", 6)):
+    for name, value in (("LAG", 4), ("WINDOW", 8), ("FITTED", 12), ("FIRST", 6), ("EVERY", 6)):
         monkeypatch.setattr(lagged, name, value)
     steps = 30
     rng = np.random.default_rng(3)

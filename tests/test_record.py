@@ -30,7 +30,11 @@ lines = st.one_of(
     st.builds(LostLine, step=st.integers(-1), file=st.text(), reason=st.text(), whole_test=st.booleans()),
     st.builds(
         AlarmLine,
-        step=st.integers(0), alarm=st.text(), value=numbers, limit=numbers, reason=st.text(),
+        step=st.integers(0),
+        alarm=st.text(),
+        value=numbers,
+        limit=numbers,
+        reason=st.text(),
         place_mm=st.tuples(numbers, numbers, numbers),
     ),
     st.builds(MeasurementLine, file=st.text(), seconds=numbers),
@@ -62,8 +66,11 @@ def test_a_line_is_one_line_of_json_that_says_what_it_is():
     line = LostLine(step=3, file="a.tif", reason="cut\nshort")
     assert "\n" not in line.text()
     assert json.loads(line.text()) == {
-        "what": "lost", "step": 3, "file": "a.tif",
-        "reason": "cut\nshort", "whole_test": False,
+        "what": "lost",
+        "step": 3,
+        "file": "a.tif",
+        "reason": "cut\nshort",
+        "whole_test": False,
     }
 
 
