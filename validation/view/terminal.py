@@ -19,7 +19,7 @@ from validation.view.state import HALF_95, State
 
 POLL_S = 0.25
 """Time between looks at the record."""
-ABOVE, BESIDE = 8, 34
+ABOVE, BESIDE = 9, 34
 """Lines of the screen above the profile, and columns beside its bars."""
 
 
@@ -81,24 +81,17 @@ def screen_of(state: State, now_s: float, lag_s: float, height: int, width: int)
 
 
 def _numbers(state: State, newest: StepLine, now_s: float, lag_s: float) -> Table:
-    table = Table.grid(padding=(0, 2), pad_edge=False)
     half, length = HALF_95 * newest.mean_strain_std, state.length_mm
-    since = "–" if state.complete else f"{now_s - state.steps[-1].unix_s:.0f} s (usually {state.interval_s:.1f} s)"
+    strain = f"{number(100 * newest.mean_strain, 3)} ± {number(100 * half, 3)} %"
+    extension = f"{number(length * newest.mean_strain, 4)} ± {number(length * half, 4)} mm"
+    since = f"{passed(now_s - state.steps[-1].unix_s)}, usually {number(state.interval_s, 1)} s"
+    table = Table.grid(padding=(0, 2), pad_edge=False)
     for row in (
-        ("step", f"{newest.step} of 0 to {state.plan.steps - 1}", "force", f"{newest.force_N:.0f} N"),
-        ("mean strain", f"{100 * newest.mean_strain:.3f} ± {100 * half:.3f} %", "since the last", since),
-        (
-            "extension",
-            f"{length * newest.mean_strain:.4f} ± {length * half:.4f} mm",
-            "file to motion",
-            f"{lag_s:.2f} s",
-        ),
-        (
-            "alarms, lost",
-            f"{len(state.alarms)}, {len(state.lost)}",
-            "work, chi2",
-            f"{newest.seconds:.2f} s, {newest.chi2_reduced:.2f}",
-        ),
+        ("step", f"{newest.step} of 0 to {state.plan.steps - 1}", "force", f"{number(newest.force_N, 0)} N"),
+        ("mean strain", strain, "since the last", "–" if state.complete else since),
+        ("extension", extension, "file to motion", f"{number(lag_s, 2)} s"),
+        ("alarms", str(len(state.alarms)), "work", f"{newest.seconds:.2f} s"),
+        ("lost", str(len(state.lost)), "chi2", number(newest.chi2_reduced, 2)),
     ):
         table.add_row(*(Text(cell, style="dim" if k % 2 == 0 else "bold") for k, cell in enumerate(row)))
     return table
@@ -115,15 +108,28 @@ def _profile(state: State, newest: StepLine, most: int, width: int) -> Table:
     alarmed = [line.place_mm[2] for line in state.alarms]
     table = Table.grid(padding=(0, 1), pad_edge=False)
     for group in reversed(groups):
-        strain, deviation, bottom, top = max(group, key=lambda pair: pair[0])
+        strain, deviation, bottom, top = max(group, key=lambda pair: pair[0] if math.isfinite(pair[0]) else -math.inf)
         length = max(0.0, strain / scale) * (width - BESIDE) if math.isfinite(strain) else 0.0
         at = any(group[0][2] <= z <= group[-1][3] for z in alarmed)
         table.add_row(
             Text(f"{(bottom + top) / 2:6.2f} mm", style="dim"),
-            Text(f"{100 * strain:6.2f} ± {100 * HALF_95 * deviation:.2f} %"),
+            Text(f"{number(100 * strain, 2):>6} ± {number(100 * HALF_95 * deviation, 2)} %"),
             Text(bar(length) + (" alarm" if at else ""), style="red" if at else "blue", no_wrap=True),
         )
     return table
+
+
+def number(value: float, digits: int) -> str:
+    """Return a number, or a dash where it is not known."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "–"
+
+
+def passed(seconds: float) -> str:
+    """Return a time that has passed."""
+    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 3 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{max(seconds, 0):.0f} s"
 
 
 def bar(length: float) -> str:
