@@ -96,6 +96,8 @@ def test_a_machine_is_stopped_once_at_the_first_alarm_and_the_rest_is_read(tmp_p
         [sys.executable, EXAMPLES / "stop_on_alarm.py"], input=text, capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines() == ["STOP", f"crack at step 5: {ALARM.reason}"]
+    (shown,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "live.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert shown in (EXAMPLES / "stop_on_alarm.py").read_text()
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.rglob("*.py")), ids=lambda path: path.name)

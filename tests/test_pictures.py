@@ -11,7 +11,7 @@ from PIL import Image
 from pdvc.live import record_of
 from tests.followed_tests import ALARM, PLAN, latest, pictured, seen, written
 from validation.view import pictures as room
-from validation.view.pictures import LARGEST_PX, Pictures, radiograph_png, residual_png
+from validation.view.pictures import RESIDUAL_PX, Pictures, radiograph_png, residual_png
 from validation.view.places import find_places
 
 
@@ -44,8 +44,8 @@ def test_a_residual_is_blue_below_and_red_above_and_white_where_there_is_none():
 
 def test_a_dark_radiograph_and_a_large_one_are_shown_too():
     assert not np.array(read(radiograph_png(np.zeros((4, 3), dtype=np.uint16)))).any()
-    large = np.zeros((3, 2 * LARGEST_PX + 1), dtype=np.float32)
-    assert read(residual_png(large)).size == ((2 * LARGEST_PX + 1 + 2) // 3, 1)
+    large = np.zeros((3, 2 * RESIDUAL_PX + 1), dtype=np.float32)
+    assert read(residual_png(large)).size == ((2 * RESIDUAL_PX + 1 + 2) // 3, 1)
 
 
 def test_the_newest_pair_stays_and_the_one_before_and_those_of_alarms(tmp_path):

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 LIMIT = 5.0
 """Largest residual that is told apart, in standard deviations."""
-LARGEST_PX = 1024
-"""Longest side of a picture: of a larger radiograph every second pixel is shown, or every third, and so on."""
+RADIOGRAPH_PX, RESIDUAL_PX = 640, 1024
+"""Longest side of a picture: of a larger image every second pixel is shown, or every third, and so on."""
 AIR = 0.995
 """Share of the pixels that are darker than what is shown white."""
 
@@ -110,14 +110,14 @@ class Pictures:
 
 def radiograph_png(counts: NDArray[np.uint16]) -> bytes:
     """Return a radiograph (row, column) in gray, as white as the air is bright."""
-    shown = _thinned(counts).astype(np.float32)
+    shown = _thinned(counts, RADIOGRAPH_PX).astype(np.float32)
     bright = max(float(np.quantile(shown, AIR)), 1.0)
     return _png(Image.fromarray(np.clip(shown * (255 / bright), 0, 255).astype(np.uint8)))
 
 
 def residual_png(residual: NDArray[np.float32]) -> bytes:
     """Return a residual over its standard deviation (row, column), white where it is none."""
-    shown = np.nan_to_num(_thinned(residual))
+    shown = np.nan_to_num(_thinned(residual, RESIDUAL_PX))
     picture = Image.fromarray(np.round((np.clip(shown / LIMIT, -1, 1) + 1) * 127.5).astype(np.uint8))
     picture.putpalette(colours("RdBu_r").tobytes())
     return _png(picture)
@@ -128,8 +128,8 @@ def colours(name: str) -> NDArray[np.uint8]:
     return np.asarray(matplotlib.colormaps[name](np.arange(256), bytes=True))[:, :3]
 
 
-def _thinned(image: NDArray[Any]) -> NDArray[Any]:
-    every = -(-max(image.shape) // LARGEST_PX)
+def _thinned(image: NDArray[Any], most: int) -> NDArray[Any]:
+    every = -(-max(image.shape) // most)
     return image[::every, ::every]
 
 

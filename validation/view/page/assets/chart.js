@@ -17,7 +17,7 @@ export class Chart {
     this.canvas.width = Math.round(width * dots);
     this.canvas.height = Math.round(height * dots);
     this.pen.scale(dots, dots);
-    this.left = 52;
+    this.left = 60;
     this.right = width - right;
     this.top = 8;
     this.bottom = height - 34;
