@@ -46,6 +46,7 @@ def main(folder: Path, scenario: str = "quick", pace_s: str = "2") -> None:
             webbrowser.open(url)
         begin("play", experiment, "--to", arriving, "--pace", pace_s)
         live.wait()
+        time.sleep(1)  # that it is over is still to be shown
         print(f"the test is over; to see it again: pdvc-bench page {file}")
 
 

@@ -297,6 +297,23 @@ class TestCommand:
         assert error == "interrupted; the same command shows it again\n"
         assert process.returncode == 130
 
+    async def told_at_the_end(self, places, capfd) -> str:
+        """Return the last line of which those who look at a page beside a measurement are told."""
+        capfd.readouterr()
+        with PageBeside(places.file) as page:
+            page.start()
+            url = ""
+            while not url:
+                url = capfd.readouterr().err
+                await asyncio.sleep(0.02)
+            async with listening(url) as listener:
+                await listener.lines(1)
+                add(places, OVER)
+                ended = asyncio.create_task(asyncio.to_thread(page.__exit__, None, None, None))
+                (last,) = await listener.lines(1)
+                await ended
+        return last
+
     def test_a_page_beside_a_measurement_ends_with_it_however_that_ends(self, tmp_path, capfd):
         places = written(tmp_path, PLAN)
         with PageBeside(places.file):
@@ -307,6 +324,7 @@ class TestCommand:
             process = page._process
             assert process.poll() is None
         assert process.returncode == 0
+        assert asyncio.run(self.told_at_the_end(places, capfd)) == OVER.text()
         code = (
             "import os, sys; from pathlib import Path; from validation.commands.watching import PageBeside\n"
             "with PageBeside(Path(sys.argv[1])) as page: page.start(); os.kill(os.getpid(), 9)"

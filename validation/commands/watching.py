@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Self
@@ -13,6 +14,9 @@ from typing import Annotated, Self
 import typer
 
 from validation.commands.parts import answering
+
+LAST_S = 1.0
+"""How long a page beside a measurement outlives it."""
 
 Followed = Annotated[
     Path, typer.Argument(metavar="FILE", help="The measurement that live was told to write, or its record.")
@@ -67,6 +71,8 @@ def watch(file: Followed) -> None:
 def _end_with_stdin() -> None:
     """End this process once who started it has ended, however that came."""
     sys.stdin.buffer.read()
+    # the record's last line, written just before, is still to be shown
+    time.sleep(LAST_S)
     os._exit(0)
 
 
