@@ -9,6 +9,11 @@ BIN := $(VENV)/bin
 run: $(VENV)/.installed
 	$(BIN)/pdvc-bench run quick -o out/quick
 
+# play the simulated test "quick" as a scanner writes it, and show it on a page; ends with the test, or with Ctrl-C
+.PHONY: live
+live: $(VENV)/.installed
+	$(BIN)/python examples/follow_a_test.py out/live
+
 # format, lint, types, tests
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .

@@ -28,7 +28,10 @@ def motion(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "command",
-    ["scenarios", "options", "simulate", "measure", "score", "report", "run", "studies", "study", "compare", "play"],
+    [
+        *("scenarios", "options", "simulate", "measure", "score", "report", "run", "studies", "study", "compare"),
+        *("prepare", "live", "play", "page", "watch"),
+    ],
 )
 def test_every_command_explains_itself(command):
     assert command in pdvc_bench("--help").stdout

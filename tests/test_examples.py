@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import json
+import re
 import runpy
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
+from pdvc.record import MeasurementLine, read_record
 from tests.command_line import install
+from tests.followed_tests import ALARM, OVER, PLAN, step
+from tests.tiny_scenarios import TINY
 from validation.methods.registry import GROUP, find_method
 from validation.scoring.scores import score
 from validation.testing.small_cases import SmallExperiment, small_scenario
+from validation.view.places import Places
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "examples"
 
 
 def run(name, folder, monkeypatch):
@@ -64,6 +73,31 @@ def test_a_study_is_run_from_python(tmp_path, monkeypatch, capsys):
     assert "photons_per_pixel" in capsys.readouterr().out
     for name in ("study.toml", "table.parquet", "summary.csv", "study.html"):
         assert (tmp_path / "out" / name).is_file()
+
+
+def test_a_test_is_played_followed_and_shown_and_nothing_is_left_running(tmp_path):
+    fewer = TINY.replace("test_steps = 25", "test_steps = 14").replace("plateau_steps = 10", "plateau_steps = 6")
+    (tmp_path / "tiny.toml").write_text(fewer)
+    command = [sys.executable, EXAMPLES / "follow_a_test.py", tmp_path / "out", tmp_path / "tiny.toml", "0"]
+    # ends only once all that it began have closed what they print to
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^the test is shown at http://127\.0\.0\.1:\d+/$", done.stdout, re.MULTILINE)
+    places = Places(file=tmp_path / "out" / "motion.nc")
+    assert isinstance(list(read_record(places.record))[-1], MeasurementLine)
+    assert json.loads((places.pictures / "latest.json").read_text())["step"] == 13
+    assert (places.pictures / "00013.residual.png").is_file()
+
+
+def test_a_machine_is_stopped_once_at_the_first_alarm_and_the_rest_is_read(tmp_path):
+    lines = (PLAN, step(0), ALARM, step(6), ALARM, OVER)
+    text = "".join(line.text() + "\n" for line in lines)
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "stop_on_alarm.py"], input=text, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines() == ["STOP", f"crack at step 5: {ALARM.reason}"]
+    (shown,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "live.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert shown in (EXAMPLES / "stop_on_alarm.py").read_text()
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.rglob("*.py")), ids=lambda path: path.name)

@@ -281,12 +281,18 @@ def test_a_record_of_another_test_is_not_gone_on_with(folder, planned, ready, tm
         follow(replace(planned, title="another"), arriving, tmp_path / "motion.nc", work=ready, idle_s=0.2)
 
 
-def test_the_commands(folder, tmp_path, followed):
+def test_the_commands(folder, tmp_path, followed, capfd):
     work, arriving, file = tmp_path / "ready", tmp_path / "arriving", tmp_path / "motion.nc"
     assert pdvc_bench("prepare", folder, "--work", work).exit_code == 0
     assert pdvc_bench("play", folder, "--to", arriving, "--pace", 0).exit_code == 0
-    done = pdvc_bench("live", folder, "--radiographs", arriving, "--work", work, "-o", file, "--json")
+    # no room for pictures: they are only looked at
+    file.with_name("motion.nc.pictures").write_text("in the way")
+    done = pdvc_bench("live", folder, "--radiographs", arriving, "--work", work, "-o", file, "--json", "--page")
     assert done.exit_code == 0, done.stderr
+    assert done.stderr.count("no pictures for a while") == 1
+    shown, error = capfd.readouterr()
+    assert not shown
+    assert error.startswith("http://127.0.0.1:")
     lines = list(read_record(record_of(file)))
     assert done.stdout.splitlines() == [line.text() for line in lines]
     assert motions(lines) == motions(followed[0])

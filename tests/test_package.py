@@ -67,6 +67,8 @@ load_scenario("quick")
     assert {str(Path(line).parent) for line in done.stdout.split()} == {str(site)}
     for name in ("report", "study", "comparison"):
         assert (site / "validation" / "report" / "templates" / f"{name}.html").is_file()
+    for name in ("index.html", "page.css", "page.js", "chart.js", "figures.js", "record.js", "icon.svg"):
+        assert (site / "validation" / "view" / "page" / "assets" / name).is_file()
     for package in ("pdvc", "simulator", "validation"):
         assert (site / package / "py.typed").is_file()
     assert not (site / "tests").exists()
@@ -74,6 +76,7 @@ load_scenario("quick")
 
 SIMULATING = {"trimesh", "xraylib", "spekpy"}
 MANY = {"dask", "distributed", "pyarrow"}
+LIVE = {"tornado"}
 
 
 def bare(folder, missing):
@@ -89,7 +92,7 @@ def bare(folder, missing):
 def test_a_laboratory_needs_no_extra_to_measure(tmp_path):
     simulate(small_scenario({}), tmp_path / "experiment")
     (tmp_path / "options.toml").write_text("sections = 4\n")
-    run = bare(tmp_path, SIMULATING | MANY | {"hypothesis"})
+    run = bare(tmp_path, SIMULATING | MANY | LIVE | {"hypothesis"})
     for command in (
         ("inspect", "experiment"),
         ("measure", "experiment", "-o", "motion.nc", "--options", "options.toml"),
@@ -108,6 +111,7 @@ def test_a_laboratory_needs_no_extra_to_measure(tmp_path):
         (("plan", "quick"), SIMULATING, "simulate"),
         (("study", "noise", "-o", "out"), MANY, "many"),
         (("compare", "quick", "-o", "out"), MANY, "many"),
+        (("page", "motion.nc"), LIVE, "live"),
     ],
 )
 def test_what_needs_an_extra_names_it_in_one_line(tmp_path, command, missing, extra):
@@ -159,7 +163,7 @@ def declared(*extras):
 
 @pytest.mark.parametrize(
     ("package", "extras"),
-    [("pdvc", ()), ("simulator", ("simulate", "spectra")), ("validation", ("simulate", "many", "strategies"))],
+    [("pdvc", ()), ("simulator", ("simulate", "spectra")), ("validation", ("simulate", "many", "live", "strategies"))],
 )
 def test_what_is_imported_is_declared(package, extras):
     owners = packages_distributions()

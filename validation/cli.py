@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from validation.commands import live, many, one
+from validation.commands import live, many, one, watching
 from validation.commands.parts import Debugging
 
 app = typer.Typer(
@@ -40,6 +40,7 @@ for _command in (
     *(one.scenarios, one.options, one.simulate, one.inspect, one.measure, one.score, one.report, one.run),
     *(many.compare, many.studies, many.study, many.plan),
     *(live.prepare, live.live, live.play),
+    *(watching.page, watching.watch),
 ):
     app.command()(_command)
 

@@ -33,6 +33,7 @@ SAYS = {
     "plan": "before the test",
     "batch": "runs on many workers",
     "report": "figures and pages",
+    "view": "a test while it runs",
     "methods": "what can be compared",
     "scoring": "errors, intervals, bound",
     "testing": "laws of one's own",

@@ -20,6 +20,7 @@ from validation.commands.parts import (
     tell,
     use_threads,
 )
+from validation.commands.watching import PageBeside
 
 
 def prepare(
@@ -63,13 +64,16 @@ def live(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the lines of the record on stdout, for another program.")
     ] = False,
+    page: Annotated[
+        bool, typer.Option("--page", help="Show the test on a page, as the command page does, until it is over.")
+    ] = False,
     threads: Threads = None,
 ) -> None:
     """Follow a test while it runs: the motion of each radiograph, with its interval, as soon as it has come.
 
     Adds a line to FILE.record.jsonl for each radiograph in FOLDER (see play), and measures the whole test into FILE
     when all that are planned in experiment.toml are in. Killed, it goes on where it was when the same command is given
-    again.
+    again. page and watch show the test meanwhile.
 
     Example:  `pdvc-bench live out/quick/experiment --radiographs out/arriving --work out/ready -o out/motion.nc`
     """
@@ -79,17 +83,36 @@ def live(
         from pdvc.experiment import read_experiment
         from pdvc.live import follow, record_of
         from pdvc.record import Line
+        from validation.view.pictures import Pictures
+        from validation.view.places import Places
+
+        places = Places(file=out)
+        pictures = Pictures(places.pictures, radiographs, tell)
 
         def show(line: Line) -> None:
+            if page:
+                shown.start()
             if as_json:
                 print(line.text(), file=stdout, flush=True)
             else:
                 print(line.words(), flush=True)
+            pictures.tell(line)
 
         chosen, planned = read_options(options), read_experiment(experiment, planned=True)
         use_threads(threads)
         idle_s = float("inf") if idle is None else idle
-        found = follow(planned, radiographs, out, chosen, work=work, progress=progress, tell=show, idle_s=idle_s)
+        with PageBeside(out) as shown:
+            # before there is a plan there is nothing to show
+            if page and places.record.is_file() and places.record.stat().st_size:
+                shown.start()
+            found = follow(
+                *(planned, radiographs, out, chosen),
+                work=work,
+                progress=progress,
+                tell=show,
+                see=pictures.see,
+                idle_s=idle_s,
+            )
     tell(f"record: {record_of(out)}")
     tell(f"measurement: {out}")
     judge(found)
