@@ -104,14 +104,14 @@ def stopped(experiment: Experiment, step: int) -> Arrival:
 
 FAULTS: dict[str, Fault] = {
     "beam off": partial(dimmed, share=0.0),
-    "beam at 90 %": partial(dimmed, share=0.9),
+    "beam at 96 %": partial(dimmed, share=0.96),
     "clipped counts": clipped,
     "sample leaves": leaving,
     "stage stopped": stopped,
 }
 SHOULD = {
     "beam off": "beam",
-    "beam at 90 %": "beam",
+    "beam at 96 %": "beam",
     "clipped counts": "saturation",
     "sample leaves": "out-of-view",
     "stage stopped": "stage",

@@ -2,10 +2,10 @@
 
 | alarm | what is tested | limit |
 | --- | --- | --- |
-| beam | transmission of the air beside the sample, less 1 | 0.03; from 0.3 on the radiograph is lost |
+| beam | transmission of the air beside the sample, less 1 | 0.03; from 0.05 on the radiograph is lost |
 | saturation | share of pixels at the largest count | 0.001 |
 | out-of-view | share of rows in which the sample covers a side of the detector, or a section that is off it | 0.02 |
-| stage | likeness to the radiograph before, less that to the reference view at the recorded angle | 0.1, then lost |
+| stage | likeness to what is seen from where the stage was, less that from where it should be | 0.05, then lost |
 | sudden | a rigid motion that differs from what was expected, over what is usual and what was uncertain | 6 |
 | localisation | growth of strain in a section beyond its part of that of all, over how far sections usually are | 8 |
 | crack | residual that is new somewhere on the sample, over its deviation (`pdvc.cells`) | 8 |
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.cells import Cells, Spot
-from pdvc.data_checks import AIR_DOUBT, AIR_ERROR, ALIKE, EDGE_SEEN, SATURATED
+from pdvc.data_checks import AIR_DOUBT, EDGE_SEEN, SATURATED
 from pdvc.deviations import beam_frame
 from pdvc.examination import StackLook, full_scale, look_at
 from pdvc.incoming import Arrival
@@ -46,6 +46,10 @@ from pdvc.window import height_mm
 
 Floats = NDArray[np.float64]
 
+AIR_LOST = 0.05
+"""Departure of the air's transmission from 1 above which the motion is not to be told from a radiograph."""
+STAGE = 0.05
+"""By how much more a radiograph is like what is seen from where the stage was, than from where it should be."""
 SUDDEN, LOCAL, CRACK = 6.0, 8.0, 8.0
 """Limits of what is over its deviation."""
 USUAL = 20
@@ -167,7 +171,7 @@ class Watch:
         """Give what is wrong with the counts of a radiograph."""
         edge, air, top, covered = self._edge, float(look.air[0]), float(look.at_top[0]), float(look.edge[0])
         if not abs(air - 1) <= AIR_DOUBT:
-            lost = not abs(air - 1) <= AIR_ERROR
+            lost = not abs(air - 1) <= AIR_LOST
             yield Alarm(
                 name="beam",
                 value=abs(air - 1),
@@ -197,14 +201,14 @@ class Watch:
         # a whole turn on, it looks as before
         away = abs((turned + np.pi) % (2 * np.pi) - np.pi)
         if before.size and away * outline > TURNED_VOXEL:
-            recorded, like = self._beside.likeness(picture, angle, before)
-            if like - recorded > ALIKE:
+            recorded, was = self._beside.likeness(picture, angle, before, self._angle_rad)
+            if was - recorded > STAGE:
                 yield Alarm(
                     name="stage",
-                    value=like - recorded,
-                    limit=ALIKE,
-                    reason=f"like the radiograph before (correlation {like:.2f}), {np.rad2deg(turned):.1f} degrees "
-                    f"from the recorded angle, rather than like the view from there ({recorded:.2f})",
+                    value=was - recorded,
+                    limit=STAGE,
+                    reason=f"seen from where it was before (correlation {was:.2f}), {np.rad2deg(turned):.1f} degrees "
+                    f"from the recorded angle, rather than from there ({recorded:.2f})",
                     spoils=True,
                 )
                 return

@@ -132,13 +132,17 @@ class Beside:
         """Return the picture (row, column) that is compared, of counts (row, column)."""
         return np.asarray(_images(counts[None], self._few, self._bins, np.zeros(1, dtype=np.int64))[0])
 
-    def likeness(self, picture: Image, angle_rad: float, before: Image) -> tuple[float, float]:
-        """Return the correlations of a picture with the reference view at its angle, and with the picture before."""
-        nearest = int(_nearest(self._reference.angle_rad, np.array([angle_rad]))[0])
-        view = self.binned(self._reference.counts[nearest])
-        this, *others = self._compare.prepared(np.stack([picture, view, before]))
-        recorded, like = (self._compare.pair(this, other) for other in others)
-        return recorded, like
+    def likeness(self, picture: Image, angle_rad: float, before: Image, before_rad: float) -> tuple[float, float]:
+        """Return how like a picture is to what is seen from its angle, and from that of the picture before it.
+
+        Correlations with the reference view from there; where it was before, that with the picture itself if it is
+        smaller: faces that come to lie along the beam make a view like many others.
+        """
+        angles = np.array([angle_rad, before_rad])
+        views = [self.binned(self._reference.counts[k]) for k in _nearest(self._reference.angle_rad, angles)]
+        this, *others = self._compare.prepared(np.stack([picture, *views, before]))
+        recorded, *was = (self._compare.pair(this, other) for other in others)
+        return recorded, min(was)
 
 
 def _comparison(geometry: ConeBeam) -> tuple[int, _Compare]:

@@ -134,8 +134,8 @@ def test_radiographs_as_they_are_raise_no_alarm(experiment, setup):
     assert [watch.seen(arrival(experiment, t)) for t in range(len(experiment.test))] == [()] * len(experiment.test)
 
 
-@pytest.mark.parametrize(("share", "spoils"), [(0.9, False), (1.08, False), (0.5, True), (0.0, True)])
-def test_another_beam_is_told_and_half_of_it_spoils_the_radiograph(experiment, setup, share, spoils):
+@pytest.mark.parametrize(("share", "spoils"), [(0.96, False), (1.04, False), (0.9, True), (0.0, True)])
+def test_another_beam_is_told_and_one_far_off_spoils_the_radiograph(experiment, setup, share, spoils):
     dark, counts = np.mean(experiment.darks, axis=0), experiment.test.counts[3]
     (alarm,) = Watch(setup).seen(arrival(experiment, 3, np.maximum(dark + share * (counts - dark), 0)))
     assert (alarm.name, alarm.spoils) == ("beam", spoils)
