@@ -2,7 +2,8 @@
 
 `play` and `live` run as a user runs them, each a process of its own. Latency is counted from when the TIFF of a
 radiograph was whole on the disk to when its motion was known; to write it down takes some hundredths of a second
-more. With `--kills N`, `live` is killed with SIGKILL N times, at moments drawn at random, and started again each
+more. SCENARIO is a name or a file; `benchmarks/long.toml` has eight times as many steps as usual, to see what memory
+does. With `--kills N`, `live` is killed with SIGKILL N times, at moments drawn at random, and started again each
 time. What is prepared is kept in the folder. The measurement of the whole test, at the end, is left out.
 """
 
@@ -23,8 +24,7 @@ import psutil
 
 from benchmarks.timing import machine
 from pdvc.deviations import beam_frame
-from pdvc.live import record_of
-from pdvc.record import StepLine, read_record
+from pdvc.record import AlarmLine, LostLine, StepLine, read_record, record_of
 from simulator.scanner import simulate
 from simulator.scenario import course_of, load_scenario
 from validation.report.figures import BLUE, TRUTH, new_figure, save
@@ -41,8 +41,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("out/live"))
     parser.add_argument("--figure", type=Path)
     options = parser.parse_args()
-    folder, experiment = options.folder / options.scenario, options.folder / options.scenario / "experiment"
     scenario = load_scenario(options.scenario)
+    folder, experiment = options.folder / scenario.name, options.folder / scenario.name / "experiment"
     print(machine())
     started = time.perf_counter()
     simulate(scenario, experiment)
@@ -54,17 +54,17 @@ def main() -> None:
     for old in (arriving, file.with_name(file.name + ".live")):
         shutil.rmtree(old, ignore_errors=True)
     record_of(file).unlink(missing_ok=True)
-    peak = _followed(experiment, arriving, folder / "ready", file, options.pace, options.kills)
+    memory = _followed(experiment, arriving, folder / "ready", file, options.pace, options.kills)
     lines = list(read_record(record_of(file)))
-    _tell(lines, arriving, peak)
+    _tell(lines, arriving, memory)
     error, deviation, course = _against_truth(lines, scenario)
     _tell_errors(error, deviation)
     if options.figure:
         _draw(lines, course, options.figure)
 
 
-def _followed(experiment: Path, arriving: Path, ready: Path, file: Path, pace_s: float, kills: int) -> float:
-    """Play and follow until the record holds all steps; return the largest memory of `live`, GiB."""
+def _followed(experiment: Path, arriving: Path, ready: Path, file: Path, pace_s: float, kills: int) -> list[float]:
+    """Play and follow until the record holds all steps; return the memory of `live` second by second, GiB."""
     arriving.mkdir(parents=True)
     live = [*BENCH, "live", experiment, "--radiographs", arriving, "--work", ready, "-o", file]
     follower = subprocess.Popen(live, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -76,11 +76,11 @@ def _followed(experiment: Path, arriving: Path, ready: Path, file: Path, pace_s:
     player = subprocess.Popen(
         [*BENCH, "play", experiment, "--to", arriving, "--pace", str(pace_s)], stderr=subprocess.DEVNULL
     )
-    rng, peak, wait_s, since = np.random.default_rng(0), 0.0, 0.0, time.monotonic()
+    rng, memory, wait_s, since = np.random.default_rng(0), list[float](), 0.0, time.monotonic()
     while not _whole(file) and follower.poll() is None:
         # not often: what is timed runs beside this
         time.sleep(1)
-        peak = max(peak, psutil.Process(follower.pid).memory_info().rss / 2**30)
+        memory.append(psutil.Process(follower.pid).memory_info().rss / 2**30)
         wait_s = wait_s or rng.uniform(5, 25)
         if kills and time.monotonic() > since + wait_s:
             os.kill(follower.pid, signal.SIGKILL)
@@ -91,22 +91,28 @@ def _followed(experiment: Path, arriving: Path, ready: Path, file: Path, pace_s:
     follower.kill()
     for process in (follower, player):
         process.wait()
-    return peak
+    return memory
 
 
 def _whole(file: Path) -> bool:
     """Return whether each planned step has a line."""
     with record_of(file).open("rb") as record:
-        plan, lines = record.readline(), sum(1 for _ in record)
+        plan, lines = record.readline(), sum(1 for line in record if b'"what": "alarm"' not in line)
     return bool(plan) and lines >= json.loads(plan)["steps"]
 
 
-def _tell(lines: list, arriving: Path, peak_gib: float) -> None:
+def _tell(lines: list, arriving: Path, memory: list[float]) -> None:
     steps = [line for line in lines if isinstance(line, StepLine)]
     latency = np.array([line.unix_s - (arriving / line.file).stat().st_mtime for line in steps])
     work = np.array([line.seconds for line in steps])
     print(f"steps: {len(steps)}, each once: {len({line.step for line in steps}) == len(steps)}; passes: ", end="")
-    print(f"{np.mean([line.passes for line in steps]):.1f}; peak memory of live: {peak_gib:.1f} GiB")
+    print(f"{np.mean([line.passes for line in steps]):.1f}")
+    quarters = [max(part) for part in np.array_split(memory, 4) if len(part)]
+    print(f"largest memory of live in each quarter of the time: {', '.join(f'{each:.2f}' for each in quarters)} GiB")
+    alarms = [f"{line.alarm} at {line.step}" for line in lines if isinstance(line, AlarmLine)]
+    print(f"alarms: {', '.join(alarms) or 'none'}")
+    lost = [line.reason for line in lines if isinstance(line, LostLine)]
+    print(f"lost: {', '.join(lost) or 'none'}")
     for name, seconds in (("latency", latency), ("work", work)):
         quantiles = np.quantile(seconds, (0.5, 0.99, 1))
         print(f"{name}: median {quantiles[0]:.2f} s, 99 % {quantiles[1]:.2f} s, largest {quantiles[2]:.2f} s")

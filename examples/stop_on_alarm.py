@@ -1,4 +1,4 @@
-"""Stop a testing machine at the first alarm: pdvc-bench live ... --json | python examples/stop_on_alarm.py."""
+"""Stop a testing machine when something breaks: pdvc-bench live ... --json | python examples/stop_on_alarm.py."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ def stop_machine() -> None:
     print("STOP", flush=True)
 
 
-stopped = False
+# loading that begins is a sudden motion, too
+stop_on, stopped = {"crack", "localisation", "beam", "stage", "out-of-view"}, False
 # read on to the end: were nobody there to read, live could not go on
 for text in sys.stdin:
     line = json.loads(text)
-    if line["what"] == "alarm" and not stopped:
+    if line["what"] == "alarm" and line["alarm"] in stop_on and not stopped:
         stop_machine()
         stopped = True
         print(f"{line['alarm']} at step {line['step']}: {line['reason']}", flush=True)

@@ -143,8 +143,8 @@ class Watch:
             "before": self._before,
             "names": np.array(list(self._raised), dtype=str),
             "raised": np.array(list(self._raised.values()), dtype=np.int64),
-            "jumps": np.array(self._jumps).reshape(len(self._jumps), -1),
-            "strains": np.array(self._strains).reshape(len(self._strains), 2, -1),
+            "jumps": np.array(self._jumps),
+            "strains": np.array(self._strains),
         }
 
     def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from pdvc.alarms import Alarm, Watch
 from pdvc.compilation import compile_kernels
@@ -33,7 +34,7 @@ from pdvc.measurement import Measurement
 from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.progress import Progress, silent
 from pdvc.radiograph_table import TABLE
-from pdvc.record import AlarmLine, Line, LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record
+from pdvc.record import AlarmLine, Line, LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record, record_of
 from pdvc.resumable import measure_into
 from pdvc.setup import Setup, set_up
 from pdvc.store import Arrays, experiment_digest, read_arrays, write_arrays
@@ -84,13 +85,15 @@ def follow(
         _check_unfinished(record)
         compile_kernels(progress=progress)
         setup = set_up(experiment, options, work=folder, progress=progress)
-        follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept, tell, see)
-        heard = time.monotonic() if follower.begun else float("inf")
-        while follower.waits and time.monotonic() < heard + idle_s:
-            if follower.look():
-                heard = time.monotonic()
-            else:
-                time.sleep(POLL_S)
+        # products of small matrices: two threads would wait for each other most of the time
+        with threadpool_limits(limits=1, user_api="blas"):
+            follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept, tell, see)
+            heard = time.monotonic() if follower.begun else float("inf")
+            while follower.waits and time.monotonic() < heard + idle_s:
+                if follower.look():
+                    heard = time.monotonic()
+                else:
+                    time.sleep(POLL_S)
         recorded = follower.recorded()
         # volumes of all scales and e of all views are not needed any more
         del follower
@@ -111,11 +114,6 @@ def _check_unfinished(record: Record) -> None:
         raise ValueError(
             f"{record.path}: expected a test to be followed, found it followed to its end: choose another file"
         )
-
-
-def record_of(file: Path) -> Path:
-    """Return where the record of a test is, that is followed into a measurement file."""
-    return file.with_name(file.name + ".record.jsonl")
 
 
 class _Follower:
@@ -142,12 +140,14 @@ class _Follower:
             height_mm=tuple(setup.sections.height_mm.tolist()),
             voxel_mm=setup.geometry.voxel_mm,
         )
+        self._blank = {name: np.array(values) for name, values in self._state().items()}
         if record.lines:
             self._resume(plan)
         else:
             for old in (self._folder / _STATE, *self._folder.glob(f"*{_TOLD}")):
                 old.unlink(missing_ok=True)
             self._add(plan)
+            self._tracker.settle()
         lines = list(read_record(record.path))
         self._done = {line.step for line in lines if isinstance(line, StepLine)}
         self._lost = {_which(line) for line in lines if isinstance(line, LostLine)}
@@ -222,8 +222,7 @@ class _Follower:
             # a radiograph that shows another thing than the sample is no reason to stop
             self._say_lost(arrival.step, arrival.file, f"step {arrival.step}: {error}")
             state = read_arrays(self._folder / _STATE)
-            if state is not None:
-                self._recall(state)
+            self._recall(self._blank if state is None else state)
             self._alarm(arrival.step, self._watch.new(arrival.step, seen))
             return
         line = step_line(self._setup, arrival, taken, time.perf_counter() - started)
@@ -256,10 +255,8 @@ class _Follower:
     def _keep(self, step: int, told: Told, lines: Iterable[Line]) -> None:
         """Keep what is needed to resume after this step; the state tells of which steps it needs what they told."""
         write_arrays(self._told_file(step), vars(told))
-        state = self._tracker.kept()
-        watched = {_WATCH + name: values for name, values in self._watch.kept().items()}
-        texts = np.array([line.text() for line in lines])
-        write_arrays(self._folder / _STATE, {**state, **watched, "key": np.array(self._key), "lines": texts})
+        state = {**self._state(), "key": np.array(self._key), "lines": np.array([line.text() for line in lines])}
+        write_arrays(self._folder / _STATE, state)
         needed = {self._told_file(t) for t in state["told"].tolist()}
         for old in set(self._folder.glob(f"*{_TOLD}")) - needed:
             old.unlink(missing_ok=True)
@@ -275,6 +272,7 @@ class _Follower:
                 "options: choose another file"
             )
         if state is None:
+            self._tracker.settle()
             return
         line, *alarms = state["lines"].tolist()
         if str(state["key"]) != self._key or (line in steps and line != steps[-1]):
@@ -300,6 +298,11 @@ class _Follower:
         self._tracker.restore(state, told)
         self._watch.restore({name[len(_WATCH) :]: state[name] for name in state if name.startswith(_WATCH)})
         self._tracker.settle()
+
+    def _state(self) -> Arrays:
+        """Return what tracker and watch know."""
+        watched = {_WATCH + name: values for name, values in self._watch.kept().items()}
+        return {**self._tracker.kept(), **watched}
 
     def _told_file(self, step: int) -> Path:
         return self._folder / f"{step:05d}{_TOLD}"

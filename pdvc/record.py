@@ -21,6 +21,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+RECORD = ".record.jsonl"
+"""What the name of a record ends with, after that of the measurement file."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
@@ -179,16 +182,24 @@ class Record:
         self._file.close()
 
 
+def record_of(file: Path) -> Path:
+    """Return where the record of a test is, that is followed into a measurement file."""
+    return file.with_name(file.name + RECORD)
+
+
 def read_record(path: Path) -> Iterator[Line]:
     """Yield the whole lines of a record; raises ValueError where a line is none of a record."""
     for number, text in enumerate(path.read_bytes().split(b"\n")[:-1], start=1):
-        try:
-            values: dict[str, Any] = json.loads(text)
-            yield _KINDS[values.pop("what")](**{key: _tuples(value) for key, value in values.items()})
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(
-                f"{path}, line {number}: expected a line of a record, got {text[:60]!r}: {error}"
-            ) from None
+        yield line_of(text, f"{path}, line {number}")
+
+
+def line_of(text: str | bytes, where: str) -> Line:
+    """Return a line by its text; raises ValueError where it is none of a record, naming where it stands."""
+    try:
+        values: dict[str, Any] = json.loads(text)
+        return _KINDS[values.pop("what")](**{key: _tuples(value) for key, value in values.items()})
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{where}: expected a line of a record, got {text[:60]!r}: {error}") from None
 
 
 def _plain(value: Any) -> Any:

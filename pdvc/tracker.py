@@ -26,7 +26,6 @@ from typing import Any
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from pdvc.coherent import by_block, excess
 from pdvc.equations import Equations, linearise
@@ -150,32 +149,6 @@ class Tracker:
 
     def take(self, radiograph: Arrival) -> Taken:
         """Take in a radiograph; raises Late of `pdvc.lagged` where its step is too far behind the newest."""
-        # products of small matrices: two threads would wait for each other most of the time
-        with threadpool_limits(limits=1, user_api="blas"):
-            return self._take(radiograph)
-
-    def settle(self) -> None:
-        """Do what can be done between radiographs: for the next one, and to know better what the process is like."""
-        with threadpool_limits(limits=1, user_api="blas"):
-            self._known.fit()
-            self._awaited = self._expecting(self._known.steps)
-
-    def kept(self) -> dict[str, NDArray[Any]]:
-        """Return all that has to be known to be restored, but for what the steps `told` told."""
-        return {
-            **self._known.kept(),
-            "pattern": self._pattern.sums,
-            "pattern_steps": np.array(self._pattern.steps),
-            "rms": np.array(self._rms),
-        }
-
-    def restore(self, kept: Mapping[str, NDArray[Any]], told: Mapping[int, Told]) -> None:
-        """Know again what it knew when `kept` was asked, with what steps told since."""
-        self._known.restore(kept, told)
-        self._pattern.sums, self._pattern.steps = np.array(kept["pattern"]), int(kept["pattern_steps"])
-        self._rms = kept["rms"].tolist()
-
-    def _take(self, radiograph: Arrival) -> Taken:
         pattern = self._pattern.found() if self._setup.options.remove_pattern else None
         images = self._images(radiograph, pattern)
         fine, noise = images(1), self._noise_of(radiograph, pattern)
@@ -208,6 +181,26 @@ class Tracker:
             residual=white[0],
             passes=passes,
         )
+
+    def settle(self) -> None:
+        """Do what can be done between radiographs: for the next one, and to know better what the process is like."""
+        self._known.fit()
+        self._awaited = self._expecting(self._known.steps)
+
+    def kept(self) -> dict[str, NDArray[Any]]:
+        """Return all that has to be known to be restored, but for what the steps `told` told."""
+        return {
+            **self._known.kept(),
+            "pattern": self._pattern.sums,
+            "pattern_steps": np.array(self._pattern.steps),
+            "rms": np.array(self._rms),
+        }
+
+    def restore(self, kept: Mapping[str, NDArray[Any]], told: Mapping[int, Told]) -> None:
+        """Know again what it knew when `kept` was asked, with what steps told since."""
+        self._known.restore(kept, told)
+        self._pattern.sums, self._pattern.steps = np.array(kept["pattern"]), int(kept["pattern_steps"])
+        self._rms = kept["rms"].tolist()
 
     def _images(self, radiograph: Arrival, pattern: Pattern | None) -> Callable[[int], Prepared]:
         """Return the function that gives a radiograph at a scale, prepared when it is first asked for."""

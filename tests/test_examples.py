@@ -8,6 +8,7 @@ import runpy
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -89,8 +90,9 @@ def test_a_test_is_played_followed_and_shown_and_nothing_is_left_running(tmp_pat
     assert (places.pictures / "00013.residual.png").is_file()
 
 
-def test_a_machine_is_stopped_once_at_the_first_alarm_and_the_rest_is_read(tmp_path):
-    lines = (PLAN, step(0), ALARM, step(6), ALARM, OVER)
+def test_a_machine_is_stopped_once_where_something_breaks_and_the_rest_is_read(tmp_path):
+    begins = replace(ALARM, alarm="sudden", step=2)
+    lines = (PLAN, step(0), begins, ALARM, step(6), ALARM, OVER)
     text = "".join(line.text() + "\n" for line in lines)
     done = subprocess.run(
         [sys.executable, EXAMPLES / "stop_on_alarm.py"], input=text, capture_output=True, text=True, check=True

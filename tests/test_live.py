@@ -15,10 +15,10 @@ from pdvc.deviations import beam_frame
 from pdvc.experiment import Experiment, ExperimentError, read_experiment
 from pdvc.gauss_newton import GaussNewton
 from pdvc.incoming import IncomingWriter
-from pdvc.live import follow, make_ready, record_of
+from pdvc.live import follow, make_ready
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.protocol import measure
-from pdvc.record import AlarmLine, Line, LostLine, MeasurementLine, PlanLine, StepLine, read_record
+from pdvc.record import AlarmLine, Line, LostLine, MeasurementLine, PlanLine, StepLine, read_record, record_of
 from simulator.scanner import simulate
 from simulator.scenario import Scenario, course_of
 from tests.command_line import pdvc_bench
@@ -232,6 +232,28 @@ def test_a_radiograph_of_another_thing_is_lost_and_the_next_ones_are_not(
     assert motions(told)[:9] == motions(followed[0])[:9]
     one, other = motions(told)[9], motions(followed[0])[10]
     assert np.all(np.array(one.displacement_std) >= np.array(other.displacement_std) * 0.99)
+
+
+def test_a_first_radiograph_that_fails_leaves_nothing_behind(
+    folder, planned, ready, tmp_path, measured_never, monkeypatch
+):
+    take = live.Tracker.take
+
+    def fails(self, radiograph):
+        taken = take(self, radiograph)
+        if radiograph.step == 0 and not tried:
+            tried.append(0)
+            raise ValueError("expected a sample")
+        return taken
+
+    monkeypatch.setattr(live.Tracker, "take", fails)
+    # with one to fail on, and without the first one at all
+    tried, found = list[int](), []
+    for name, steps in (("whole", range(4)), ("without", range(1, 4))):
+        arriving = played(folder, tmp_path / name, steps)
+        found.append(follow_to_its_end(planned, arriving, tmp_path / f"{name}.nc", work=ready, idle_s=0.2))
+    assert tried == [0]
+    assert motions(found[0]) == motions(found[1])
 
 
 def test_what_an_earlier_run_left_does_not_enter_a_new_record(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pdvc.live import record_of
+from pdvc.record import record_of
 from tests.followed_tests import ALARM, PLAN, latest, pictured, seen, written
 from validation.view import pictures as room
 from validation.view.pictures import RESIDUAL_PX, Pictures, radiograph_png, residual_png

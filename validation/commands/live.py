@@ -81,8 +81,8 @@ def live(
     stdout = sys.stdout
     with answering(resume="give the same command again to go on from here") as progress:
         from pdvc.experiment import read_experiment
-        from pdvc.live import follow, record_of
-        from pdvc.record import Line
+        from pdvc.live import follow
+        from pdvc.record import Line, record_of
         from validation.view.pictures import Pictures
         from validation.view.places import Places
 

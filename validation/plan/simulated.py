@@ -103,7 +103,7 @@ def _at_rest(scenario: Scenario) -> Scenario:
 
 def _course(scenario: Scenario, design: Design) -> Course:
     """Return what would happen in a test of this design."""
-    acquisition, loading = scenario.acquisition, scenario.loading
+    acquisition, loading, motion = scenario.acquisition, scenario.loading, scenario.motion
     share = design.steps / acquisition.test_steps
     changed = scenario.model_copy(
         update={
@@ -119,6 +119,9 @@ def _course(scenario: Scenario, design: Design) -> Course:
                     "plateau_steps": round(loading.plateau_steps * share),
                     "necking_steps": max(round(loading.necking_steps * share), 1),
                 }
+            ),
+            "motion": motion.model_copy(
+                update={"slip": motion.slip.model_copy(update={"step": int(motion.slip.step * share)})}
             ),
         }
     )

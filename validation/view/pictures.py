@@ -60,7 +60,11 @@ class Pictures:
 
     def tell(self, line: Line) -> None:
         """Keep the pictures of a step that raises an alarm, which may be told before or after they are made."""
-        if isinstance(line, AlarmLine):
+        if not isinstance(line, AlarmLine):
+            return
+        if self._newest is None or self._newest[0] != line.step:
+            self._awaited.add(line.step)
+        else:
             self._attempt(lambda: self._keep(line.step))
 
     def _show(self, arrival: Arrival, taken: Taken) -> None:
@@ -81,9 +85,8 @@ class Pictures:
                 old.unlink(missing_ok=True)
 
     def _keep(self, step: int) -> None:
-        if self._newest is None or self._newest[0] != step:
-            self._awaited.add(step)
-            return
+        """Keep the pictures of the newest step."""
+        assert self._newest is not None
         self._awaited.discard(step)
         for name, picture in self._newest[1].items():
             write_whole(self._folder / ALARMS / f"{step:05d}.{name}.png", picture)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from pdvc.record import PlanLine, read_record
+from pdvc.record import RECORD, PlanLine, read_record, record_of
 
-RECORD = ".record.jsonl"
-"""What the name of a record ends with, as `pdvc.live.record_of` makes it; to import that loads all kernels."""
 LATEST, ALARMS = "latest.json", "alarms"
 """In the folder of pictures: of which step the newest are, and the folder of those of alarms."""
 
@@ -23,7 +21,7 @@ class Places:
     @property
     def record(self) -> Path:
         """Return where its record is."""
-        return self.file.with_name(self.file.name + RECORD)
+        return record_of(self.file)
 
     @property
     def pictures(self) -> Path:

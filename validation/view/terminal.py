@@ -6,16 +6,16 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from itertools import islice
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from pdvc.record import Line, MeasurementLine, StepLine, read_record
+from pdvc.record import Line, MeasurementLine, StepLine, line_of
 from validation.view.places import LATEST, Places
 from validation.view.state import HALF_95, State
+from validation.view.tail import Tail
 
 POLL_S = 0.25
 """Time between looks at the record."""
@@ -34,9 +34,9 @@ def watch(places: Places, console: Console) -> None:
 
 def _lines(places: Places) -> Iterator[Line]:
     """Yield the lines of a record as they come, the measurement last."""
-    told = 0
+    tail, told = Tail(places.record), 0
     while True:
-        for line in islice(read_record(places.record), told, None):
+        for line in _added(tail, places, told):
             told += 1
             yield line
             if isinstance(line, MeasurementLine):
@@ -44,15 +44,21 @@ def _lines(places: Places) -> Iterator[Line]:
         time.sleep(POLL_S)
 
 
+def _added(tail: Tail, places: Places, told: int) -> Iterator[Line]:
+    """Yield the lines that were added after so many; raises ValueError where one is none of a record."""
+    for number, added in enumerate(tail.added(), start=told + 1):
+        yield line_of(added.text, f"{places.record}, line {number}")
+
+
 def _draw(places: Places, console: Console) -> None:
-    length, state = -1, None
+    tail, lines = Tail(places.record), list[Line]()
     with Live(console=console, auto_refresh=False, vertical_overflow="crop") as screen:
-        while state is None or state.measurement is None:
-            if (now := places.record.stat().st_size) != length:
-                length, state = now, State.of(read_record(places.record))
-            assert state is not None
-            height = console.size.height - 1
+        while True:
+            lines += _added(tail, places, len(lines))
+            state, height = State.of(lines), console.size.height - 1
             screen.update(screen_of(state, time.time(), _lag_s(places), height, console.size.width), refresh=True)
+            if state.measurement is not None:
+                return
             time.sleep(POLL_S)
 
 
