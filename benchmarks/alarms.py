@@ -134,12 +134,13 @@ def watched(scenario: Scenario, fault: Fault = arrival, last: int | None = None)
         scores = []
         for step in range(len(experiment.test) if last is None else last):
             radiograph = fault(experiment, step)
-            found = watch.seen(radiograph)
+            found, score = watch.seen(radiograph), 0.0
             if not any(alarm.spoils for alarm in found):
                 taken = tracker.take(radiograph)
                 found += watch.followed(step_line(setup, radiograph, taken, 0.0), taken)
                 tracker.settle()
-                scores.append(watch.spot.score if watch.spot else 0.0)
+                score = watch.spot.score if watch.spot else 0.0
+            scores.append(score)
             raised += [(step, alarm.name, alarm.place_mm) for alarm in watch.new(step, found)]
     return Watched(raised=raised, scores=scores)
 

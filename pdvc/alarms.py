@@ -130,9 +130,12 @@ class Watch:
 
     def new(self, step: int, alarms: tuple[Alarm, ...]) -> tuple[Alarm, ...]:
         """Return those of a step's alarms that were not raised a few steps ago."""
-        fresh = tuple(alarm for alarm in alarms if abs(step - self._raised.get(alarm.name, -QUIET)) >= QUIET)
-        self._raised.update({alarm.name: step for alarm in fresh})
-        return fresh
+        fresh = []
+        for alarm in alarms:
+            if abs(step - self._raised.get(alarm.name, -QUIET)) >= QUIET:
+                self._raised[alarm.name] = step
+                fresh.append(alarm)
+        return tuple(fresh)
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that has to be known to be restored."""
@@ -236,6 +239,8 @@ class Watch:
         """
         sections, motions = taken.amplitude.shape
         seen = _seen(self._setup.sections.names, np.deg2rad(line.angle_deg))
+        if not seen:
+            return
         shown = np.array(list(seen.values())) @ np.tile(np.eye(motions), sections) / sections
         jump = shown @ (taken.amplitude - taken.expected).ravel()
         past, self._jumps = self._jumps, [*self._jumps[-USUAL + 1 :], jump]

@@ -15,6 +15,7 @@ where it is. Its place is therefore the middle of where much is new over some mo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -77,7 +78,12 @@ class Cells:
         """Steps so far."""
 
     def add(self, residual: Image, amplitude: Floats, angle_rad: float) -> Spot:
-        """Take in a step: residual over its deviation (row, column), zero where unused, at amplitudes in voxels."""
+        """Take in a step: residual over its deviation (row, column), zero where unused, at amplitudes in voxels.
+
+        Nothing is new on a sample thinner than a cell.
+        """
+        if not self._inside.any():
+            return Spot(score=0.0, place_mm=(math.nan, math.nan, math.nan))
         seen, (row, column) = self._summed(residual), self._places(amplitude, angle_rad)
         on = self._inside & (row >= 0) & (column >= 0) & (row < seen.shape[0]) & (column < seen.shape[1])
         new = np.where(on, seen[np.where(on, row, 0), np.where(on, column, 0)], 0.0)
@@ -104,6 +110,7 @@ class Cells:
 
     def _summed(self, residual: Image) -> Floats:
         """Return w_t (row, column); zero where too little is used."""
+        residual = np.where(np.isfinite(residual), residual, 0)
         used = ndimage.uniform_filter((residual != 0).astype(float), self._pixels, mode="constant")
         mean = ndimage.uniform_filter(residual.astype(float), self._pixels, mode="constant")
         counts = used > USED_SHARE

@@ -14,7 +14,7 @@ whose scale s in Q = s Q_1 is found in turn with w, so that a slip is followed i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -66,6 +66,8 @@ class _Fit:
 
     window: slice
     """The steps that tell them."""
+    steps: tuple[int, ...]
+    """Those of them that had told something."""
     about: Floats
     """Amplitudes (unknown,) about which those of the first step may be."""
     given: Deviations
@@ -145,7 +147,7 @@ class LaggedFilter:
         self._take_over(self.steps)
         if self._finds:
             window = slice(max(self.steps - WINDOW, 0), self.steps)
-            process, given = self._process(window, self._about()), self._given(window)
+            process, given = self._process(window, self._about(), self._told), self._given(window)
             # nothing was known of a step before its radiograph
             given.misfit[step - window.start] = 1
             if slips and step + 1 == self.steps and step - window.start >= 2:
@@ -173,23 +175,28 @@ class LaggedFilter:
         They are taken over `MEANWHILE` steps later, when they are ready or waited for: what comes out does not depend
         on the clock.
         """
-        if self._finds and self._fit is None and self.steps >= max(self._fitted + EVERY, FIRST):
+        over = self.steps >= self.space.shape[0]
+        if self._finds and self._fit is None and not over and self.steps >= max(self._fitted + EVERY, FIRST):
             self._fitted = self.steps
             window = slice(max(self.steps - FITTED, 0), self.steps)
-            self._fit = self._begun(window, self._about(), self._given(window))
+            self._fit = self._begun(window, tuple(sorted(self._told)), self._about(), self._given(window))
 
     def _take_over(self, steps: int) -> None:
         """Wait for deviations that are being fitted, and take them over, where so many steps have come."""
         if self._fit is not None and steps >= self._fitted + MEANWHILE:
-            found = self._fit.found.result()
+            fit, self._fit = self._fit, None
+            try:
+                found = fit.found.result()
+            except np.linalg.LinAlgError:
+                # what could not be fitted stays as it is, whoever asked first
+                return
             # the ends of a window are not those of the test
             shared = {name: getattr(found, name) for name in ("bend_voxel", "roughness", "apparent_voxel")}
             self._adopt(replace(self._deviations, **shared))
-            self._fit = None
 
-    def _begun(self, window: slice, about: Floats, given: Deviations) -> _Fit:
-        found = self._thread.submit(self._process(window, about).fitted, given, 1)
-        return _Fit(window=window, about=about, given=given, found=found)
+    def _begun(self, window: slice, steps: tuple[int, ...], about: Floats, given: Deviations) -> _Fit:
+        found = self._thread.submit(self._process(window, about, steps).fitted, given, 1)
+        return _Fit(window=window, steps=steps, about=about, given=given, found=found)
 
     def kept(self) -> dict[str, NDArray[Any]]:
         """Return all that it has to know to be restored, but for what steps told: `told` are those that it needs."""
@@ -200,6 +207,7 @@ class LaggedFilter:
             else {
                 **{_GIVEN + name: values for name, values in vars(fit.given).items()},
                 "window": np.array([fit.window.start, fit.window.stop]),
+                "fitted_of": np.array(fit.steps, dtype=np.int64),
                 "about": fit.about,
             }
         )
@@ -227,7 +235,8 @@ class LaggedFilter:
         self._fit = None
         if "window" in kept:
             given = Deviations(**{name: kept[_GIVEN + name] for name in vars(self._deviations)})
-            self._fit = self._begun(slice(*kept["window"].tolist()), kept["about"], given)
+            window, steps = slice(*kept["window"].tolist()), tuple(kept["fitted_of"].tolist())
+            self._fit = self._begun(window, steps, kept["about"], given)
 
     @property
     def _first(self) -> int:
@@ -307,13 +316,13 @@ class LaggedFilter:
         given = _within(self._deviations, window)
         return replace(given, end_voxel=np.full_like(given.end_voxel, self.space.prior_voxel))
 
-    def _process(self, window: slice, about: Floats) -> Process:
-        """Return the process of some steps, in few modes, about where its first step may be."""
+    def _process(self, window: slice, about: Floats, told_by: Collection[int]) -> Process:
+        """Return the process of some steps, in few modes, about where its first step may be, from those that told."""
         space = self._few.within(window)
         steps, unknowns = space.shape[0], len(space.to_amplitude)
         design, data = np.zeros((steps, unknowns, unknowns)), np.zeros((steps, unknowns))
         for step, told in self._told.items():
-            if window.start <= step < window.stop:
+            if window.start <= step < window.stop and step in told_by:
                 design[step - window.start] = told.design
                 data[step - window.start] = told.data - told.design @ about
         return Process(space, Seen(design=design, data=data))

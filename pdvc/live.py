@@ -5,7 +5,7 @@ radiograph as soon as it is whole (`pdvc.incoming`), finds the motion (`pdvc.tra
 (`pdvc.record`), with what is alarming (`pdvc.alarms`); when all that are planned are in, the whole test is measured as
 in `pdvc.protocol`.
 
-What the tracker knows is kept before a line is added to the record, line included: a process that is killed and
+What the tracker knows is kept before lines are added to the record, lines included: a process that is killed and
 started again goes on with the radiograph that it had in hand, to the same numbers.
 """
 
@@ -34,7 +34,17 @@ from pdvc.measurement import Measurement
 from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.progress import Progress, silent
 from pdvc.radiograph_table import TABLE
-from pdvc.record import AlarmLine, Line, LostLine, MeasurementLine, PlanLine, Record, StepLine, read_record, record_of
+from pdvc.record import (
+    Line,
+    LostLine,
+    MeasurementLine,
+    PlanLine,
+    Record,
+    StepLine,
+    line_of,
+    read_record,
+    record_of,
+)
 from pdvc.resumable import measure_into
 from pdvc.setup import Setup, set_up
 from pdvc.store import Arrays, experiment_digest, read_arrays, write_arrays
@@ -146,13 +156,14 @@ class _Follower:
         else:
             for old in (self._folder / _STATE, *self._folder.glob(f"*{_TOLD}")):
                 old.unlink(missing_ok=True)
-            self._add(plan)
+            self._write(plan)
             self._tracker.settle()
         lines = list(read_record(record.path))
+        lost = [line for line in lines if isinstance(line, LostLine)]
         self._done = {line.step for line in lines if isinstance(line, StepLine)}
-        self._lost = {_which(line) for line in lines if isinstance(line, LostLine)}
-        self._alarmed = {(line.step, line.alarm) for line in lines if isinstance(line, AlarmLine)}
-        # what was lost is looked at again, and said once
+        self._done |= {line.step for line in lost if line.left_out}
+        self._lost = {_which(line) for line in lost}
+        # what could not be read, or came late, is looked at again, and said once
         self._incoming = self._opened(self._done)
 
     @property
@@ -169,7 +180,7 @@ class _Follower:
         """Take in what has come; return whether anything has."""
         arrived, given_up = self._incoming.look()
         for unreadable in given_up:
-            self._say_lost(unreadable.step, unreadable.file, unreadable.reason)
+            self._say_lost(LostLine(step=unreadable.step, file=unreadable.file, reason=unreadable.reason))
             # a right line may follow a wrong one of the table
             if unreadable.file != TABLE:
                 self._done.add(unreadable.step)
@@ -183,9 +194,9 @@ class _Follower:
         Raises ExperimentError where none has, or one that was followed cannot be read any more.
         """
         lines = list(read_record(self._record.path))
-        spoilt = {line.step for line in lines if isinstance(line, LostLine) and not line.whole_test}
+        left_out = {line.step for line in lines if isinstance(line, LostLine) and line.left_out}
         followed = {line.step for line in lines if isinstance(line, StepLine)}
-        arrived = [each for each in self._opened(()).look()[0] if each.step in followed or each.step not in spoilt]
+        arrived, _ = self._opened(left_out).look()
         gone = sorted(followed - {each.step for each in arrived})
         if gone or not arrived:
             found = f"that of step {listed(gone)} not any more" if gone else "none"
@@ -208,65 +219,70 @@ class _Follower:
         self._done.add(arrival.step)
         seen = self._watch.seen(arrival)
         if any(alarm.spoils for alarm in seen):
-            self._alarm(arrival.step, self._watch.new(arrival.step, seen))
-            reason = "; ".join(alarm.reason for alarm in seen if alarm.spoils)
-            self._say_lost(arrival.step, arrival.file, f"step {arrival.step}: {reason}")
+            self._lose(arrival, "; ".join(alarm.reason for alarm in seen if alarm.spoils), seen)
             return
         try:
             taken = self._tracker.take(arrival)
         except Late as error:
             reason = f"{error}: only the measurement of the whole test has it"
-            self._say_lost(arrival.step, arrival.file, reason, whole_test=True)
+            self._say_lost(LostLine(step=arrival.step, file=arrival.file, reason=reason))
             return
         except ValueError as error:
             # a radiograph that shows another thing than the sample is no reason to stop
-            self._say_lost(arrival.step, arrival.file, f"step {arrival.step}: {error}")
             state = read_arrays(self._folder / _STATE)
             self._recall(self._blank if state is None else state)
-            self._alarm(arrival.step, self._watch.new(arrival.step, seen))
+            self._lose(arrival, str(error), seen)
             return
         line = step_line(self._setup, arrival, taken, time.perf_counter() - started)
-        alarms = self._watch.new(arrival.step, (*seen, *self._watch.followed(line, taken)))
-        self._keep(arrival.step, taken.told, (line, *(alarm.line(arrival.step) for alarm in alarms)))
-        self._add(line)
-        self._alarm(arrival.step, alarms)
+        write_arrays(self._told_file(arrival.step), vars(taken.told))
+        self._add(line, *self._new(arrival, (*seen, *self._watch.followed(line, taken))))
         self._see(arrival, taken)
         # after the motion is told, and not when there is time: what comes out must not depend on the clock
         self._tracker.settle()
 
-    def _add(self, line: Line) -> None:
-        self._record.add(line)
-        self._tell(line)
+    def _lose(self, arrival: Arrival, reason: str, alarms: tuple[Alarm, ...]) -> None:
+        """Say that a radiograph shows no motion."""
+        reason = f"step {arrival.step}: {reason}"
+        line = LostLine(step=arrival.step, file=arrival.file, reason=reason, left_out=True)
+        self._add(line, *self._new(arrival, alarms))
 
-    def _alarm(self, step: int, alarms: Iterable[Alarm]) -> None:
-        """Add alarms of a step: each once, however often the test is resumed."""
-        for line in (alarm.line(step) for alarm in alarms):
-            if (step, line.alarm) not in self._alarmed:
-                self._alarmed.add((step, line.alarm))
-                self._add(line)
+    def _new(self, arrival: Arrival, alarms: tuple[Alarm, ...]) -> list[Line]:
+        return [alarm.line(arrival.step) for alarm in self._watch.new(arrival.step, alarms)]
 
-    def _say_lost(self, step: int, file: str, reason: str, *, whole_test: bool = False) -> None:
+    def _say_lost(self, line: LostLine) -> None:
         """Say that a radiograph cannot be used: once, however often the test is resumed."""
-        line = LostLine(step=step, file=file, reason=reason, whole_test=whole_test)
         if _which(line) not in self._lost:
             self._lost.add(_which(line))
-            self._add(line)
+            self._write(line)
 
-    def _keep(self, step: int, told: Told, lines: Iterable[Line]) -> None:
-        """Keep what is needed to resume after this step; the state tells of which steps it needs what they told."""
-        write_arrays(self._told_file(step), vars(told))
+    def _add(self, *lines: Line) -> None:
+        """Keep what is needed to resume after some lines, and write them."""
         state = {**self._state(), "key": np.array(self._key), "lines": np.array([line.text() for line in lines])}
         write_arrays(self._folder / _STATE, state)
         needed = {self._told_file(t) for t in state["told"].tolist()}
         for old in set(self._folder.glob(f"*{_TOLD}")) - needed:
             old.unlink(missing_ok=True)
+        self._write(*lines)
+
+    def _write(self, *lines: Line) -> None:
+        for line in lines:
+            self._record.add(line)
+            self._tell(line)
+
+    def _state(self) -> Arrays:
+        """Return what tracker and watch know; what steps told is kept apart."""
+        watched = {_WATCH + name: values for name, values in self._watch.kept().items()}
+        return {**self._tracker.kept(), **watched}
 
     def _resume(self, plan: PlanLine) -> None:
-        """Know again what was known when the last line was written, or was about to be."""
-        steps = [line.text() for line in read_record(self._record.path) if isinstance(line, StepLine)]
-        path = self._folder / _STATE
+        """Know again what was known when the last lines were written, or were about to be.
+
+        Whether they were told, too, nobody knows: they are told again.
+        """
+        path, written = self._folder / _STATE, list(self._record.lines)
+        followed = any(isinstance(line, StepLine) for line in read_record(self._record.path))
         state = read_arrays(path)
-        if self._record.lines[0] != plan.text() or (steps and state is None):
+        if written[0] != plan.text() or (followed and state is None):
             raise ValueError(
                 f"{self._record.path}: expected the record of this test, found that of another one, or of other "
                 "options: choose another file"
@@ -274,15 +290,17 @@ class _Follower:
         if state is None:
             self._tracker.settle()
             return
-        line, *alarms = state["lines"].tolist()
-        if str(state["key"]) != self._key or (line in steps and line != steps[-1]):
+        texts = state["lines"].tolist()
+        after = written[written.index(texts[0]) + 1 :] if texts[0] in written else []
+        if str(state["key"]) != self._key or any(isinstance(line_of(text, ""), StepLine) for text in after):
             raise ValueError(
                 f"{path}: expected the same reference scan, plan, options, folder and software as now, and as much as "
                 "the record tells, found others: choose another file"
             )
-        for text in (line, *alarms):
-            if text not in self._record.lines:
+        for text in texts:
+            if text not in written:
                 self._record.add_text(text)
+            self._tell(line_of(text, str(path)))
         self._recall(state)
 
     def _recall(self, state: Arrays) -> None:
@@ -298,11 +316,6 @@ class _Follower:
         self._tracker.restore(state, told)
         self._watch.restore({name[len(_WATCH) :]: state[name] for name in state if name.startswith(_WATCH)})
         self._tracker.settle()
-
-    def _state(self) -> Arrays:
-        """Return what tracker and watch know."""
-        watched = {_WATCH + name: values for name, values in self._watch.kept().items()}
-        return {**self._tracker.kept(), **watched}
 
     def _told_file(self, step: int) -> Path:
         return self._folder / f"{step:05d}{_TOLD}"

@@ -6,7 +6,7 @@ whatever happens to the process, and anything may read it meanwhile. The first l
 
     {"what": "plan", "title": ..., "steps": 127, "height_mm": [...], "voxel_mm": 0.0107}
     {"what": "step", "step": 0, "angle_deg": ..., "time_s": ..., "displacement_voxel": [[...], ...], ...}
-    {"what": "alarm", "step": 61, "alarm": "crack", "value": 9.1, "limit": 6.0, "place_mm": [0.2, null, 1.4], ...}
+    {"what": "alarm", "step": 61, "alarm": "crack", "value": 9.1, "limit": 8.0, "place_mm": [0.2, null, 1.4], ...}
     {"what": "lost", "step": 4, "file": "00004.tif", "reason": "..."}
     {"what": "measurement", "file": "motion.nc", "seconds": 312.0}
 """
@@ -124,8 +124,8 @@ class LostLine(Line):
     """-1 where it is not known."""
     file: str
     reason: str
-    whole_test: bool = False
-    """Whether the measurement of the whole test has it all the same."""
+    left_out: bool = False
+    """Whether it was looked at and shows no motion, so that the measurement of the whole test leaves it out, too."""
 
     def words(self) -> str:
         """Return the line for a reader."""

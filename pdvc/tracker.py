@@ -284,7 +284,11 @@ class Tracker:
         )
         pattern = self._pattern.found() if options.remove_pattern else None
         amplitude = (self._known.space.to_amplitude @ self._known.expected(step).mean).reshape(1, *self._basis.shape)
-        return self._meeting(self._images(alike, pattern)(1), amplitude, self._noise_of(alike, pattern), alike)
+        try:
+            return self._meeting(self._images(alike, pattern)(1), amplitude, self._noise_of(alike, pattern), alike)
+        except ValueError:
+            # expected where it cannot be: the radiograph will tell
+            return None
 
     def _meeting(self, fine: Prepared, amplitude: Floats, noise: Noise, radiograph: Arrival) -> _Awaited:
         """Return what the noise meets at amplitudes (1, section, motion), and what that of views and flats does."""

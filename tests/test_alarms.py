@@ -93,6 +93,16 @@ def test_what_was_always_there_is_not_new_and_more_material_is_no_crack():
         assert max(scores[LEAST_USUAL:]) < 8
 
 
+def test_a_pixel_that_is_not_finite_and_a_sample_thinner_than_a_cell_do_no_harm():
+    cells = Cells(GEOMETRY, BASIS, HULL)
+    for t, image in residuals(20, 3, (0.3, 0.2, 0.5), since=14, height=8.0):
+        image[10, 10] = np.nan if t == 5 else image[10, 10]
+        spot = cells.add(image, still(), t * STEP_RAD)
+    assert spot.score > 8
+    thin = replace(HULL, support_mm=np.full((22, DIRECTIONS), 1e-3))
+    assert Cells(GEOMETRY, BASIS, thin).add(image, still(), 0.0).score == 0
+
+
 def test_cells_that_are_restored_go_on_as_if_nothing_had_been():
     one, other = Cells(GEOMETRY, BASIS, HULL), Cells(GEOMETRY, BASIS, HULL)
     images = list(residuals(14, 2))
@@ -239,7 +249,8 @@ def test_an_alarm_that_goes_on_is_raised_again_after_some_steps(setup):
     watch, alarm = Watch(setup), Alarm(name="crack", value=9.0, limit=8.0, reason="")
     raised = [bool(watch.new(step, (alarm,))) for step in range(2 * QUIET + 1)]
     assert [step for step, new in enumerate(raised) if new] == [0, QUIET, 2 * QUIET]
-    assert watch.new(2 * QUIET + 1, (replace(alarm, name="beam"), alarm))[0].name == "beam"
+    beam = replace(alarm, name="beam")
+    assert watch.new(2 * QUIET + 1, (beam, alarm, beam)) == (beam,)
 
 
 def test_a_watch_that_is_restored_goes_on_as_if_nothing_had_been(experiment, setup):

@@ -150,6 +150,25 @@ def test_gone_on_with_it_finds_the_same_to_the_last_digit(killed, monkeypatch):
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_fit_that_is_begun_again_rests_on_what_was_told_when_it_began(monkeypatch):
+    for name, value in (("FIRST", 6), ("EVERY", 6), ("MEANWHILE", 4)):
+        monkeypatch.setattr(lagged, name, value)
+    rng = np.random.default_rng(3)
+    data, order = told(rng, motion(rng, 12)), (0, 1, 2, 3, 5, 4, 6, 7, 8, 9, 10, 11)
+    whole, again = tracker(12, "fit"), tracker(12, "fit")
+    # it is begun after step 5, before step 4 has come
+    for step in order[:7]:
+        whole.add(step, data[step])
+        whole.fit()
+    again.restore({name: np.array(values) for name, values in whole.kept().items()}, dict(enumerate(data)))
+    for step in order[7:]:
+        for each in (whole, again):
+            each.add(step, data[step])
+            each.fit()
+    for one, other in zip(whole.at(11), again.at(11), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_a_slip_is_followed_in_the_radiograph_that_shows_it():
     steps, slipped = 24, 15
     rng = np.random.default_rng(5)

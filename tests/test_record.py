@@ -27,7 +27,7 @@ lines = st.one_of(
         **dict.fromkeys(("strain", "strain_std"), several),
         **dict.fromkeys(SINGLE, numbers),
     ),
-    st.builds(LostLine, step=st.integers(-1), file=st.text(), reason=st.text(), whole_test=st.booleans()),
+    st.builds(LostLine, step=st.integers(-1), file=st.text(), reason=st.text(), left_out=st.booleans()),
     st.builds(
         AlarmLine,
         step=st.integers(0),
@@ -70,7 +70,7 @@ def test_a_line_is_one_line_of_json_that_says_what_it_is():
         "step": 3,
         "file": "a.tif",
         "reason": "cut\nshort",
-        "whole_test": False,
+        "left_out": False,
     }
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Self
 
 import typer
 
-from validation.commands.parts import answering
+from validation.commands.parts import answering, tell
 
 LAST_S = 1.0
 """How long a page beside a measurement outlives it."""
@@ -82,6 +82,7 @@ class PageBeside:
     def __init__(self, file: Path) -> None:
         self._file = file
         self._process: subprocess.Popen[bytes] | None = None
+        self._tried = False
 
     def __enter__(self) -> Self:
         return self
@@ -94,8 +95,14 @@ class PageBeside:
             self._process.wait()
 
     def start(self) -> None:
-        """Start it, unless it was; its address is printed on stderr."""
-        if self._process is None:
+        """Start it, unless it was tried before; its address is printed on stderr."""
+        if self._tried:
+            return
+        self._tried = True
+        # without it the measurement goes on
+        try:
             command = [sys.executable, "-m", "pdvc_bench", "page", str(self._file), "--until-closed"]
             # in a session of its own: Ctrl-C is for this process, and ends the page by closing its stdin
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=2, start_new_session=True)
+        except OSError as error:
+            tell(f"no page: {error}")

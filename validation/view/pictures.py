@@ -6,7 +6,7 @@ A folder beside the record, readable without this software::
     00057.residual.png      the used window: residual over its standard deviation, from -5 (blue) to 5 (red)
     latest.json             {"step": 57, "lag_s": 0.4, "alarms": [41]}: of which step the newest are, how long it took
                             from the radiograph's file to its motion, and of which alarms there are pictures
-    alarms/                 the same two of each step at which an alarm was raised
+    alarms/                 the same two of each step at which an alarm was raised, and a motion told
 
 Each file is written whole. Once there is a newer pair, the one before it stays for those who are still reading it.
 """
@@ -68,6 +68,8 @@ class Pictures:
             self._attempt(lambda: self._keep(line.step))
 
     def _show(self, arrival: Arrival, taken: Taken) -> None:
+        if self._newest and arrival.step < self._newest[0]:
+            return
         # by the clock of the disk, which may be that of another machine
         lag_s = time.time() - (self._radiographs / arrival.file).stat().st_mtime
         pair = {"radiograph": radiograph_png(arrival.counts), "residual": residual_png(taken.residual)}

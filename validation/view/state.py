@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
 
+from pdvc.radiograph_table import TABLE
 from pdvc.record import AlarmLine, Line, LostLine, MeasurementLine, PlanLine, StepLine
 
 HALF_95 = 1.96
@@ -55,7 +56,8 @@ class State:
     @property
     def complete(self) -> bool:
         """Return whether each planned radiograph has come or was lost."""
-        gone = {line.step for line in self.steps} | {line.step for line in self.lost if line.step >= 0}
+        # a right line may follow a wrong one of the table
+        gone = {line.step for line in self.steps} | {line.step for line in self.lost if line.file != TABLE}
         return len(gone) >= self.plan.steps
 
     @property
@@ -73,6 +75,7 @@ class State:
             return "waiting for the first radiograph"
         if self.complete:
             return "all radiographs are in: the whole test is being measured"
-        if now_s - self.steps[-1].unix_s > max(LEAST_LATE_S, LATE * self.interval_s):
+        usual = self.interval_s
+        if math.isfinite(usual) and now_s - self.steps[-1].unix_s > max(LEAST_LATE_S, LATE * usual):
             return "no new radiograph for a while"
         return "following"

@@ -131,6 +131,8 @@ class _Picture(_Guarded):
         except OSError:
             raise HTTPError(404) from None
         self.set_header("Content-Type", "image/png")
+        # asked for again it is sent again only where it is another one
+        self.set_header("Cache-Control", "no-cache")
         self.finish(picture)
 
 
