@@ -237,12 +237,16 @@ class Tracker:
             passes += 1
             return linearise(images(scale).images, self._basis, amplitude.reshape(1, *self._basis.shape))
 
-        scales = sorted(self._rest, reverse=True)
+        scales, tried = sorted(self._rest, reverse=True), []
         second = scales[-2:][0]
-        tried = [(pass_at(second, start), start) for start in starts]
+        close = NEAR * float(images(second).noise_rms or 1)
+        for start in starts:
+            tried.append((pass_at(second, start), start))
+            if tried[-1][0].rms < close:
+                break
         equations, start = min(tried, key=lambda each: float(each[0].chi2[0]))
         # coarser scales are for what is far off
-        near, at = equations.rms < NEAR * float(images(second).noise_rms or 1), start
+        near, at = equations.rms < close, start
         for scale in scales[scales.index(second) if near else 0 :]:
             variance = float(images(scale).noise_rms or 1) ** 2
             if scale != second or at is not start:
