@@ -215,12 +215,16 @@ class StepNoise:
         weighted: Sensitivities,
         places: Floats,
         corner: tuple[int, int],
+        pool: Executor | None = None,
     ) -> StepNoise:
-        """Work out what the noise of a step meets; `shares` of its views, `places` of `Systematic.places`."""
+        """Work out what the noise of a step meets; `shares` of its views, `places` of `Systematic.places`.
+
+        With a pool, halves of the images side by side.
+        """
         image, view = noise.step(step), mean_of_views(noise, shares)
-        moved = spread(weighted, places, noise.flat.shape)
+        moved = spread(weighted, places, noise.flat.shape, pool)
         both = [(moved, view.slope, (0, 0)), (weighted, -image.slope, corner)]
-        shared = overlaid(both, noise.flat.shape)
+        shared = overlaid(both, noise.flat.shape, pool)
         return cls(image=image, view=view, weighted=weighted, moved=moved, shared=shared)
 
     def own(

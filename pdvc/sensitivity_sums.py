@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -96,8 +97,15 @@ class Pile:
         return total.reshape(functions * unknowns, functions * unknowns)
 
 
-def overlaid(fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]], shape: tuple[int, ...]) -> Sensitivities:
-    """Return the sum, over a detector of `shape`, of fields times factors (row, column), from their first pixel on."""
+def overlaid(
+    fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]],
+    shape: tuple[int, ...],
+    pool: Executor | None = None,
+) -> Sensitivities:
+    """Return the sum, over a detector of `shape`, of fields times factors (row, column), from their first pixel on.
+
+    With a pool, halves of each field side by side.
+    """
     motions = fields[0][0].motions
     low, high = np.full(shape[0], np.iinfo(np.int64).max), np.zeros(shape[0], dtype=np.int64)
     for field, _, (row, _) in fields:
@@ -106,9 +114,19 @@ def overlaid(fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]], sha
         high[rows] = np.maximum(high[rows], field.first + field.values.shape[2] // motions)
     low, values = _blank(low, high, shape, motions)
     for field, factor, (row, column) in fields:
-        first = low[row : row + len(field.values)]
-        _add_to(values, field.values, (field.first - first) * motions, factor, row, column)
+        offset = (field.first - low[row : row + len(field.values)]) * motions
+
+        add = partial(_add_rows, values, field.values, offset, factor, (row, column))
+        for _ in (map if pool is None else pool.map)(add, _halves(len(field.values))):
+            pass
     return Sensitivities(values=values, first=low, motions=motions)
+
+
+def _add_rows(
+    out: Image, values: Image, offset: NDArray[np.int64], factor: Image, corner: tuple[int, int], rows: slice
+) -> None:
+    """Add some rows of a field times a factor to `out`; see `_add_to`."""
+    _add_to(out, values[rows], offset[rows], factor[rows], corner[0] + rows.start, corner[1])
 
 
 def _blank(
@@ -125,8 +143,13 @@ def _blank(
     return low, np.zeros((*shape, max(int((high - low).max()), 1) * motions), dtype=np.float32)
 
 
-def spread(field: Sensitivities, places: Floats, shape: tuple[int, ...]) -> Sensitivities:
-    """Return R^T of a field over the window: what each pixel of the detector takes part in."""
+def spread(
+    field: Sensitivities, places: Floats, shape: tuple[int, ...], pool: Executor | None = None
+) -> Sensitivities:
+    """Return R^T of a field over the window: what each pixel of the detector takes part in.
+
+    With a pool, halves of the window side by side, to other last digits where they meet.
+    """
     row = np.clip(np.floor(places[..., 0]).astype(np.int64), 0, shape[0] - 2)
     top, bottom = np.maximum(row.min(axis=1) - 1, 0), np.minimum(row.max(axis=1) + 2, shape[0] - 1)
     span = field.values.shape[2] // field.motions
@@ -135,8 +158,25 @@ def spread(field: Sensitivities, places: Floats, shape: tuple[int, ...]) -> Sens
         low[start : end + 1] = np.minimum(low[start : end + 1], first)
         high[start : end + 1] = np.maximum(high[start : end + 1], first + span)
     low, values = _blank(low, high, shape, field.motions)
-    _scatter(field.values, (field.first[:, None] - low) * field.motions, places, values)
+    offset = (field.first[:, None] - low) * field.motions
+    if pool is None:
+        _scatter(field.values, offset, places, values)
+    else:
+        upper, lower = _halves(len(field.values))
+        # neighbours add to the same pixels
+        apart = np.zeros_like(values)
+        for _ in pool.map(
+            lambda part: _scatter(field.values[part[0]], offset[part[0]], places[part[0]], part[1]),
+            ((upper, values), (lower, apart)),
+        ):
+            pass
+        first = int(top[lower].min(initial=len(values)))
+        values[first:] += apart[first:]
     return Sensitivities(values=values, first=low, motions=field.motions)
+
+
+def _halves(rows: int) -> tuple[slice, slice]:
+    return slice(0, rows // 2), slice(rows // 2, rows)
 
 
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -239,6 +240,9 @@ def test_fields_whose_rows_meet_different_sections_are_spread_section_by_section
         one = replace(field, values=parts[..., k : k + 1].astype(np.float32), first=0 * field.first, motions=1)
         expected = dense(spread(one, places, whole), 1)[..., 0]
         np.testing.assert_allclose(dense(together, 10)[..., k], expected, atol=1e-5)
+    with ThreadPoolExecutor(2) as pool:
+        halves = spread(field, places, whole, pool)
+    np.testing.assert_allclose(halves.values, together.values, atol=1e-5)
 
 
 @law(25)
@@ -253,7 +257,10 @@ def test_fields_laid_over_each_other_take_room_for_the_sections_that_rows_meet_a
     places[..., :2] = np.stack(np.indices(window), axis=-1) + np.array(corner) + [moved + 0.3, 0.5]
     elsewhere = spread(field, places, whole)
     even = np.ones(whole, dtype=np.float32)
-    together = overlaid([(elsewhere, even, (0, 0)), (field, even[:24, :3], corner)], whole)
+    fields = [(elsewhere, even, (0, 0)), (field, even[:24, :3], corner)]
+    together = overlaid(fields, whole)
+    with ThreadPoolExecutor(2) as pool:
+        np.testing.assert_array_equal(overlaid(fields, whole, pool).values, together.values)
     # three sections a row, those of rows taken from, and of rows as far as the field was moved
     assert together.values.shape[2] // 2 <= 3 + 2 + (4 + abs(moved)) // rise
     expected = dense(elsewhere, 300)
