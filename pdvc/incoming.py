@@ -148,15 +148,24 @@ class Incoming:
         )
 
 
+def check_arriving(folder: Path) -> None:
+    """Raise ExperimentError, in one line, where radiographs cannot arrive: no folder, or another table than theirs."""
+    RadiographTable(folder / TABLE, 0).appended()
+
+
 class IncomingWriter:
     """Write radiographs into a folder as a scanner does: each TIFF whole, then its line.
 
-    Makes the folder where there is none. Raises ExperimentError, in one line, where it holds a table already.
+    Makes the folder where there is none. Raises ExperimentError, in one line, where it holds a table already, or a
+    file has its name.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError):
+            raise ExperimentError(f"{folder}: expected a folder, or none yet, found a file") from None
         begin_table(folder / TABLE)
 
     def write(self, step: int, counts: NDArray[np.uint16], angle_rad: float, time_s: float, force_N: float) -> None:

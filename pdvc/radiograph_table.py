@@ -95,8 +95,10 @@ class RadiographTable:
         try:
             return self._path.stat().st_size
         except (FileNotFoundError, NotADirectoryError):
-            if not self._path.parent.is_dir():
-                raise ExperimentError(f"{self._path.parent}: expected a folder of radiographs, found none") from None
+            folder = self._path.parent
+            if not folder.is_dir():
+                found = "a file" if folder.exists() else "none"
+                raise ExperimentError(f"{folder}: expected a folder of radiographs, found {found}") from None
             return 0
 
     def _check_first(self, text: bytes) -> None:

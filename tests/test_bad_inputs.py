@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,15 +19,17 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.bad_inputs.bench import Bench, Outcome
-from benchmarks.bad_inputs.catalogue import CATALOGUE
+from benchmarks.bad_inputs.catalogue import CATALOGUE, FOLLOWED
 from benchmarks.bad_inputs.experiments import EXPERIMENTS, SMALL
 from benchmarks.bad_inputs.record import BadInput, unchanged
-from benchmarks.bad_inputs.table import page, row
+from benchmarks.bad_inputs.table import followed_part, measured_part, page, parts, row
 from pdvc.experiment import DARKS, DESCRIPTION, FLATS, REFERENCE, TEST
 from simulator.scanner import describe, simulate
 from simulator.scenario import course_of
+from tests.command_line import only_line, pdvc_bench
 
-NAMED = {case.name: case for case in CATALOGUE}
+ALL = (*CATALOGUE, *FOLLOWED)
+NAMED = {case.name: case for case in ALL}
 BAD = [case for case in CATALOGUE if case.due in ("error", "warning")]
 PAGE = Path(__file__).parents[1] / "docs" / "bad-inputs.md"
 
@@ -67,26 +70,32 @@ def digest(folder):
 
 def test_the_catalogue_is_large_and_each_entry_has_a_name_of_its_own():
     assert len(BAD) >= 80
-    assert len(NAMED) == len(CATALOGUE)
+    assert len(NAMED) == len(ALL)
     assert all(re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name) for name in NAMED)
-    assert all(case.wrong.endswith(".") for case in CATALOGUE)
-    assert {case.experiment for case in CATALOGUE} <= set(EXPERIMENTS)
+    assert all(case.wrong.endswith(".") for case in ALL)
+    assert {case.experiment for case in ALL} <= set(EXPERIMENTS)
+    assert {case.command for case in CATALOGUE} == {"measure"}
+    assert {case.command for case in FOLLOWED} == {"prepare", "live", "play", "page", "watch"}
+    assert all(case.name.startswith(f"{case.command}-") for case in FOLLOWED)
 
 
 def test_no_two_inputs_are_the_same_and_none_is_the_good_one(bench, tmp_path):
-    seen = {}
-    for case in CATALOGUE:
-        changed = tmp_path / case.name
+    seen, good = {}, {}
+    for case in ALL:
         if case.change is unchanged:
             what = ""
         else:
-            bench.changed(case, changed)
-            what = digest(changed)
-            assert what != digest(bench.simulated(case.experiment)), case.name
-        key = (what, case.experiment, case.options, case.arguments)
+            if case.experiment not in good:
+                bench.changed(replace(case, change=unchanged), tmp_path / f"good-{len(good)}" / "experiment")
+                good[case.experiment] = digest(tmp_path / f"good-{len(good)}")
+            bench.changed(case, tmp_path / case.name / "experiment")
+            what = digest(tmp_path / case.name)
+            assert what != good[case.experiment], case.name
+        # what else goes on is no part of the folder
+        key = (what, case.experiment, case.options, case.command, case.arguments, case.meanwhile)
         assert key not in seen, f"{case.name} is {seen[key]}"
         seen[key] = case.name
-    assert seen["", "small", "", ()] == "good-small"
+    assert seen["", "small", "", "measure", (), nullcontext] == "good-small"
 
 
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "small"])
@@ -99,8 +108,9 @@ def test_each_experiment_is_a_scenario_of_its_own(name):
 
 @pytest.mark.skipif(not PAGE.is_file(), reason="the page is not written yet: make bad-inputs")
 def test_the_page_lists_the_catalogue():
-    rows = [line.split("|")[1].strip().rstrip("*") for line in PAGE.read_text().splitlines() if line.startswith("| ")]
-    assert rows[2:] == list(NAMED)
+    for part, listed in zip(parts(PAGE.read_text()), (CATALOGUE, FOLLOWED), strict=True):
+        rows = [line.split("|")[1].strip().rstrip("*") for line in part.splitlines() if line.startswith("| ")]
+        assert rows[2:] == [case.name for case in listed]
 
 
 answers = st.sampled_from(["", "trusted", "doubtful", "failed"])
@@ -208,9 +218,70 @@ def test_a_good_test_is_measured_and_reported_by_the_bench(tmp_path):
     assert not (tmp_path / case.name).exists()
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("prepare-nowhere", "live-no-radiographs-folder", "live-table-header", "live-record-complete"),
+        *("live-into-a-folder", "live-idle-negative", "play-from-beyond", "play-into-a-table", "page-port-70000"),
+        *("page-port-in-use", "page-record-random", "watch-plan-of-another-kind"),
+    ],
+)
+def test_commands_about_a_test_that_runs_answer_in_one_line(bench, monkeypatch, name):
+    monkeypatch.setattr(bench, "ready", bench.simulated)  # so that nothing is prepared: it is not needed
+    seen = bench.outcome(NAMED[name])
+    assert seen.code == NAMED[name].code
+    assert len(seen.errors) == 1
+    assert not seen.faults
+
+
+def test_what_live_would_find_in_the_end_is_refused_before_anything_is_made(bench, tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    for radiographs, out, work, said in (
+        ("none", "motion.nc", "work", "expected a folder of radiographs, found none"),
+        ("file", "motion.nc", "work", "expected a folder of radiographs, found a file"),
+        ("folder", "folder", "work", "expected a file to write, found a folder"),
+        ("folder", "motion.nc", "file", "--work: expected a folder, or none yet, found"),
+    ):
+        result = pdvc_bench(
+            *("live", bench.simulated("small"), "--radiographs", tmp_path / radiographs),
+            *("-o", tmp_path / out, "--work", tmp_path / work),
+        )
+        assert result.exit_code == 2
+        assert said in only_line(result)
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "faults"),
+    [
+        ("live-step-twice", {}, ()),
+        ("live-step-twice", {"code": 2, "console": ("lost: table: expected a step", EXPECTED)}, ()),
+        ("live-step-twice", {"console": ("verdict: trusted",)}, ("SILENT",)),
+        ("live-step-twice", {"code": 2, "console": (EXPECTED,)}, ("SILENT",)),
+        ("live-step-twice", {"console": ("lost: step 1",)}, ("unclear error",)),
+        ("live-table-header", {}, ("SILENT",)),
+        ("live-work-in-use", {"code": 1, "console": ("error: ready: in use by process 7",)}, ()),
+        ("live-work-in-use", {"code": 2, "console": ("error: ready: in use by process 7",)}, ("CRASH, exit code 2",)),
+        ("page-port-70000", {"code": 2, "console": ("╭─ Error ─╮", "│ Input should │", "│ be less │", "╰─╯")}, ()),
+        ("page-port-70000", {"code": 2, "console": ("Usage: page",)}, ("CRASH, exit code 2",)),
+    ],
+)
+def test_what_was_lost_has_to_be_told_and_an_error_has_its_exit_code(name, changes, faults):
+    seen = Outcome(case=NAMED[name], code=0, console=("lost: table: expected a step",))
+    assert replace(seen, **changes).faults == faults
+
+
+def test_a_page_is_of_two_parts_each_of_which_can_be_written_alone():
+    measurements = measured_part([measured(case, "trusted") for case in CATALOGUE], "a machine", 180.0)
+    tests = followed_part([Outcome(case=case, code=2, console=(EXPECTED,)) for case in FOLLOWED], "a machine", 60.0)
+    assert parts(page(measurements, tests)) == (measurements, tests)
+    assert parts("# Bad inputs\n") == ("", "")
+
+
 def test_silent_inputs_are_counted_first_and_marked_in_their_rows():
     outcomes = [measured(case, "trusted") for case in CATALOGUE]
-    text = page(outcomes, "a machine", 3.0)
+    text = measured_part(outcomes, "a machine", 180.0)
     silent = [case.name for case in BAD]
     assert f"{len(BAD)} x SILENT" in text
     assert re.findall(r"^\| ([a-z0-9-]+) .*\*\*SILENT\*\*", text, re.M) == silent

@@ -154,7 +154,10 @@ class TestTable:
         missing = Folder(tmp_path / "none")
         assert missing.refused() == f"{tmp_path / 'none'}: expected a folder of radiographs, found none"
         (tmp_path / "file").touch()
-        assert "expected a folder of radiographs" in Folder(tmp_path / "file").refused()
+        assert (
+            Folder(tmp_path / "file").refused()
+            == f"{tmp_path / 'file'}: expected a folder of radiographs, found a file"
+        )
 
     @pytest.mark.parametrize(
         "first", ["step;file;angle_deg;time_s;force_N\n", "0,0.tif,0,0,0\n", "\n", "x" * 300 + "\n"]

@@ -258,8 +258,12 @@ class TestCommand:
         assert "motion.nc.record.jsonl: expected the record of a test, found none" in only_line(result)
         for text, found in (
             ("not JSON\n", "line 1: expected a line of a record"),
-            ("", "begins with a plan, found another"),
-            (step(0).text() + "\n", "begins with a plan, found another"),
+            ("", "begins with a plan, found no whole line"),
+            (step(0).text() + "\n", "begins with a plan, found a line of kind step"),
+            (
+                '{"what": "plan", "title": "", "steps": 9, "height_mm": 4.0, "voxel_mm": 1}\n',
+                "line 1: expected a line of",
+            ),
             ('{"what": "weather"}\n', "line 1: expected a line of a record"),
         ):
             (tmp_path / "motion.nc.record.jsonl").write_text(text)
@@ -274,9 +278,13 @@ class TestCommand:
             async with served(places) as url:
                 return await asyncio.to_thread(pdvc_bench, "page", places.file, "--port", re.findall(r"\d+", url)[-1])
 
-        for result in (asyncio.run(main()), pdvc_bench("page", places.file, "--host", "256.1.1.1")):
-            assert result.exit_code == 1
-            assert re.match(r"error: (127.0.0.1|256.1.1.1):\d+: ", only_line(result))
+        taken = asyncio.run(main())
+        assert taken.exit_code == 1
+        assert re.fullmatch(r"error: 127.0.0.1: expected a free port, found \d+ in use", only_line(taken))
+        for host in ("256.1.1.1", "192.0.2.1", ""):
+            nowhere = pdvc_bench("page", places.file, "--host", host)
+            assert nowhere.exit_code == 2
+            assert f"error: --host: expected an address of this machine, found '{host}'" in only_line(nowhere)
 
     def test_it_prints_its_address_and_ends_with_ctrl_c(self, tmp_path):
         places = written(tmp_path, PLAN)

@@ -28,7 +28,11 @@ from validation.scoring.centre_line import centre_line
 
 _PROGRESS = re.compile(r": \d+ of \d+ in [\d.]+ s$|^(measurement|report): ")
 _RAW = re.compile(r"^Traceback |:\d+: \w*Warning: ")
-_EXPLAINED = re.compile(r"expected|missing|unknown key|not valid TOML|truncated")
+_USAGE, _USAGE_ENDS = "╭─ Error", "╰"
+"""What a frame begins and ends with, in which options that are wrong by themselves are told."""
+_EXPLAINED = re.compile(
+    r"expected|missing|unknown key|not valid TOML|truncated|in use by|Input should be|Missing|is due"
+)
 """What every error of this software says: what was expected, or what is missing; and no dictionary of Python's."""
 LOST = 255
 """What the server of processes says where it lost the exit code: then the command is given again."""
@@ -63,7 +67,12 @@ class Outcome:
     @property
     def errors(self) -> tuple[str, ...]:
         """Return the lines of the console that say what is wrong."""
-        return tuple(line for line in self.console if line.startswith("error: "))
+        return (*(line for line in self.console if line.startswith("error: ")), *_framed(self.console))
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """Return the lines of the console that say which radiograph, or line of a table, was lost."""
+        return tuple(line for line in self.console if line.startswith("lost: "))
 
     @property
     def raw(self) -> tuple[str, ...]:
@@ -83,13 +92,28 @@ class Outcome:
         return tuple(_faults(self))
 
 
+def _framed(console: Sequence[str]) -> Iterator[str]:
+    """Give what is told in frames, each in one line."""
+    words: list[str] | None = None
+    for line in console:
+        if line.startswith(_USAGE):
+            words = []
+        elif words is not None and line.startswith(_USAGE_ENDS):
+            yield " ".join(words)
+            words = None
+        elif words is not None:
+            words += line.strip("│ ").split()
+
+
 def _faults(seen: Outcome) -> Iterator[str]:
     due, answer = seen.case.due, seen.answer
     if seen.code is None:
         yield "NO END"
         return
-    if seen.code not in (*MEASURED, 2) or (seen.code == 2 and not seen.errors):
+    if seen.code not in (*MEASURED, seen.case.code) or (seen.code == seen.case.code and not seen.errors):
         yield f"CRASH, exit code {seen.code}"
+    elif due == "told" and not seen.lost:
+        yield "SILENT"
     elif due == "good" and answer == "error":
         yield "REFUSED"
     elif due == "good" and answer == "warning":
@@ -102,7 +126,7 @@ def _faults(seen: Outcome) -> Iterator[str]:
         yield "SILENT" if answer in ("trusted", "nothing") else "MEASURED, AN ERROR IS DUE"
     if seen.raw:
         yield "raw warnings on the console"
-    if len(seen.errors) > 1 or any(not _EXPLAINED.search(line) or "{'" in line for line in seen.errors):
+    if len(seen.errors) > 1 or any(not _EXPLAINED.search(line) or "{'" in line for line in (*seen.errors, *seen.lost)):
         yield "unclear error"
     if seen.left:
         yield f"leaves {', '.join(seen.left)}"
@@ -171,6 +195,8 @@ class Bench:
         shutil.rmtree(place, ignore_errors=True)
         folder, result = place / "experiment", place / "motion.nc"
         self.changed(case, folder)
+        if case.command != "measure":
+            return self._followed(case, place)
         arguments = ["measure", str(folder), "-o", str(result), *case.arguments]
         if case.options:
             (place / "options.toml").write_text(case.options, encoding="utf-8")
@@ -179,12 +205,11 @@ class Bench:
         code = self._command(arguments, place / "console.log")
         seconds = time.perf_counter() - started
         known = {"experiment", "options.toml", "console.log", "motion.nc"}
-        text = (place / "console.log").read_text(encoding="utf-8", errors="replace").replace(f"{place}{os.sep}", "")
         seen = partial(
             Outcome,
             case=case,
             code=code,
-            console=tuple(line for line in text.splitlines() if line and not _PROGRESS.search(line)),
+            console=_console(place),
             left=()
             if code is None
             else tuple(sorted(path.name for path in place.iterdir() if path.name not in known)),
@@ -193,6 +218,39 @@ class Bench:
         found = seen() if code not in MEASURED or not result.is_file() else seen(**self._result(place))
         shutil.rmtree(place)
         return found
+
+    def _followed(self, case: BadInput, place: Path) -> Outcome:
+        """Give a command about a test while it runs; nothing stays on disk."""
+        if "ready" in case.arguments and case.command != "prepare":
+            shutil.copytree(self.ready(case.experiment), place / "ready")
+        arguments = [case.command, *case.arguments]
+        if case.options:
+            (place / "options.toml").write_text(case.options, encoding="utf-8")
+            arguments += ["--options", "options.toml"]
+        # what was begun can be gone on with
+        known = {"console.log", "ready", "motion.nc.live", "motion.nc.record.jsonl"}
+        known |= {path.name for path in place.iterdir()}
+        with case.meanwhile(place):
+            started = time.perf_counter()
+            code = self._command(arguments, place / "console.log", place)
+            seconds = time.perf_counter() - started
+        console = _console(place)
+        measured = code in MEASURED and case.command == "live"
+        left = () if measured else tuple(sorted(path.name for path in place.iterdir() if path.name not in known))
+        shutil.rmtree(place)
+        return Outcome(case=case, code=code, console=console, left=left, seconds=seconds)
+
+    def ready(self, name: str) -> Path:
+        """Return what prepare makes of an experiment of EXPERIMENTS, made at the first call."""
+        experiment = self.simulated(name)
+        work = experiment.with_name(f"{experiment.name}.ready")
+        with self._making:
+            if not work.is_dir():
+                log = work.with_name(f"{work.name}.log")
+                code = self._command(["prepare", str(experiment), "--work", str(work)], log)
+                if code != 0:
+                    raise RuntimeError(f"prepare: expected exit code 0, got {code}: {log.read_text(encoding='utf-8')}")
+        return work
 
     def _result(self, place: Path) -> dict[str, Any]:
         """Return what a result and its report say."""
@@ -211,11 +269,11 @@ class Bench:
             "report": html.unescape(page.read_text(encoding="utf-8")) if code == 0 else None,
         }
 
-    def _command(self, arguments: list[str], log: Path) -> int | None:
+    def _command(self, arguments: list[str], log: Path, within: Path | None = None) -> int | None:
         """Run the command line in a process of its own; returns its exit code, or None beyond the limit."""
         log.touch()  # a process that is stopped early has not opened it
         for _ in range(3):
-            process = self._processes.Process(target=_run, args=(arguments, str(log)), daemon=True)
+            process = self._processes.Process(target=_run, args=(arguments, str(log), within), daemon=True)
             process.start()
             process.join(self._limit_s)
             if process.is_alive():
@@ -237,11 +295,19 @@ def largest_strain(measurement: Measurement) -> float:
     return float(np.nanmax(strain)) if np.isfinite(strain).any() else math.nan
 
 
-def _run(arguments: list[str], log: str) -> None:
-    """Run the command line as in a shell, with its console in a file."""
+def _console(place: Path) -> tuple[str, ...]:
+    """Return what a command printed beside its progress, line by line, folders left out."""
+    text = (place / "console.log").read_text(encoding="utf-8", errors="replace").replace(f"{place}{os.sep}", "")
+    return tuple(line for line in text.splitlines() if line and not _PROGRESS.search(line))
+
+
+def _run(arguments: list[str], log: str, within: Path | None) -> None:
+    """Run the command line as in a shell, in a folder, with its console in a file."""
     with open(log, "wb") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+    if within is not None:
+        os.chdir(within)
     from validation.cli import app
 
     app(arguments)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.bad_inputs import counts, description, experiments, files, options, order
+from benchmarks.bad_inputs import counts, description, experiments, files, followed, options, order
 from benchmarks.bad_inputs.record import BadInput
 
 CATALOGUE: tuple[BadInput, ...] = (
@@ -16,3 +16,6 @@ CATALOGUE: tuple[BadInput, ...] = (
     *experiments.CONTROLS,
 )
 """In the order of the table: bad ones by what is wrong with them, then good ones."""
+
+FOLLOWED: tuple[BadInput, ...] = followed.CASES
+"""Those of the commands about a test while it runs."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -27,9 +28,10 @@ BEAM = (REFERENCE, TEST, FLATS)
 """The stacks that are made with X-rays."""
 FULL = 65535
 
-Due = Literal["error", "warning", "good", "unknowable"]
-"""What is due: an error in one line; a result whose verdict is not `trusted`, or an error; a trusted result; or
-nothing, because the folder is that of another experiment, without a fault."""
+Due = Literal["error", "warning", "good", "unknowable", "told"]
+"""What is due: an error in one line; a result whose verdict is not `trusted`, or an error; a trusted result; nothing,
+because the folder is that of another experiment, without a fault; or a line that tells what was lost, and no end for
+that."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +41,11 @@ class Folder:
     path: Path
     simulated: Callable[[str], Path]
     """Gives the folder of a good experiment, by its name in `experiments.EXPERIMENTS`."""
+
+    @property
+    def beside(self) -> Path:
+        """Return the folder in which commands are given: it holds the experiment."""
+        return self.path.parent
 
     def counts(self, name: str) -> Counts:
         """Return a stack (image, row, column), counts."""
@@ -80,7 +87,14 @@ class BadInput:
     options: str = ""
     """Content of the file given to --options; empty: none is given."""
     arguments: tuple[str, ...] = ()
-    """Further arguments of `pdvc-bench measure`."""
+    """Further arguments of `pdvc-bench measure`; of another command all arguments."""
+    command: str = "measure"
+    """Command of `pdvc-bench`; all but `measure` are given in the folder that holds `experiment`, and `ready`, as
+    prepare leaves it, where their arguments name it."""
+    meanwhile: Callable[[Path], AbstractContextManager[object]] = nullcontext
+    """What else goes on in that folder as long as the command runs."""
+    code: int = 2
+    """Exit code that is due with an error."""
 
 
 def stacks(edit: Callable[[Counts], NDArray[Any]], *names: str) -> Change:

@@ -15,6 +15,7 @@ from validation.commands.parts import (
     Options,
     Threads,
     answering,
+    check_folder,
     judge,
     read_options,
     tell,
@@ -42,6 +43,7 @@ def prepare(
 
         chosen = read_options(options)
         use_threads(threads)
+        check_folder("--work", work)
         make_ready(read_experiment(experiment, planned=True), chosen, work=work, progress=progress)
     tell(f"ready: {work}")
 
@@ -81,6 +83,7 @@ def live(
     stdout = sys.stdout
     with answering(resume="give the same command again to go on from here") as progress:
         from pdvc.experiment import read_experiment
+        from pdvc.incoming import check_arriving
         from pdvc.live import follow
         from pdvc.record import Line, record_of
         from validation.view.pictures import Pictures
@@ -100,6 +103,12 @@ def live(
 
         chosen, planned = read_options(options), read_experiment(experiment, planned=True)
         use_threads(threads)
+        # what would be told in the end, hours later, or once all is prepared
+        if out.is_dir():
+            raise ValueError(f"{out}: expected a file to write, found a folder")
+        if work is not None:
+            check_folder("--work", work)
+        check_arriving(radiographs)
         idle_s = float("inf") if idle is None else idle
         with PageBeside(out) as shown:
             # before there is a plan there is nothing to show

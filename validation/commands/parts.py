@@ -86,6 +86,12 @@ def use_threads(count: int | None) -> None:
     numba.set_num_threads(count)
 
 
+def check_folder(option: str, folder: Path) -> None:
+    """Raise ValueError where what an option names is to be a folder, and is a file."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{option}: expected a folder, or none yet, found {folder}, a file")
+
+
 @contextmanager
 def answering(resume: str = "nothing half-written was left under its final name") -> Iterator[ProgressBars]:
     """Show progress on stderr, and errors there in one line."""

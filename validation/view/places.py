@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from pdvc.record import RECORD, PlanLine, read_record, record_of
+from pdvc.record import RECORD, Line, PlanLine, read_record, record_of
 
 LATEST, ALARMS = "latest.json", "alarms"
 """In the folder of pictures: of which step the newest are, and the folder of those of alarms."""
@@ -41,5 +41,15 @@ def find_places(named: Path) -> Places:
         )
     first = next(iter(read_record(places.record)), None)
     if not isinstance(first, PlanLine):
-        raise ValueError(f"{places.record}: expected the record of a test, which begins with a plan, found another")
+        found = "no whole line" if first is None else f"a line of kind {first.what}"
+        raise ValueError(f"{places.record}: expected the record of a test, which begins with a plan, found {found}")
+    check_words(first, f"{places.record}, line 1")
     return places
+
+
+def check_words(line: Line, where: str) -> None:
+    """Raise ValueError in one line, naming where it stands, where a line of a record holds values of another kind."""
+    try:
+        line.words()
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: expected a line of a record, of kind {line.what}: {error}") from None

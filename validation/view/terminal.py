@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdvc.record import Line, MeasurementLine, StepLine, line_of
-from validation.view.places import LATEST, Places
+from validation.view.places import LATEST, Places, check_words
 from validation.view.state import HALF_95, State
 from validation.view.tail import Tail
 
@@ -47,7 +47,10 @@ def _lines(places: Places) -> Iterator[Line]:
 def _added(tail: Tail, places: Places, told: int) -> Iterator[Line]:
     """Yield the lines that were added after so many; raises ValueError where one is none of a record."""
     for number, added in enumerate(tail.added(), start=told + 1):
-        yield line_of(added.text, f"{places.record}, line {number}")
+        where = f"{places.record}, line {number}"
+        line = line_of(added.text, where)
+        check_words(line, where)
+        yield line
 
 
 def _draw(places: Places, console: Console) -> None:

@@ -6,6 +6,7 @@ It reads files and nothing else, so that it may be started and ended whatever `l
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import socket
 import time
@@ -37,12 +38,19 @@ HEADERS = {
 
 
 async def serve(places: Places, host: str, port: int, tell: Callable[[str], None]) -> None:
-    """Serve the page of a test until cancelled; `tell` is called with its address. Port 0: any that is free."""
+    """Serve the page of a test until cancelled; `tell` is called with its address. Port 0: any that is free.
+
+    Raises ValueError, in one line, where this machine has no such address, OSError where the port is not to be had.
+    """
     access = Access.at(host)
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         listener = socket.create_server((host, port), family=family)
     except OSError as error:
+        if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+            raise ValueError(f"--host: expected an address of this machine, found {host!r}") from None
+        if error.errno == errno.EADDRINUSE:
+            raise OSError(error.errno, f"expected a free port, found {port} in use", host) from None
         raise OSError(error.errno, error.strerror, f"{host}:{port}") from None
     listener.setblocking(False)
     port = int(listener.getsockname()[1])
