@@ -33,7 +33,7 @@ from pdvc.setup import set_up
 from pdvc.tracker import Tracker
 from simulator.scanner import simulate
 from simulator.scenario import Scenario, load_scenario
-from validation.report.figures import new_figure, save
+from validation.report.figures import TRUTH, new_figure, save
 
 BEGINS = 80
 """Step at which faults made from counts begin."""
@@ -233,6 +233,7 @@ def _tell_cracks(results: list[tuple[Any, int, Watched]], path: Path | None) -> 
     scores = [test.scores for name, _, test in results if name == "clean"]
     clean = np.array([max(each[k : k + FOUND_WITHIN]) for each in scores for k in range(0, len(each), FOUND_WITHIN)])
     limits = np.linspace(3, 12, 91)
+    false, at_once = (clean[:, None] > limits).mean(axis=0), 0
     figure, (axes,) = new_figure(4.2, 3.2, 1)
     for size in dict.fromkeys(name for name, _, _ in results if isinstance(name, tuple)):
         tests = [(begins, test) for name, begins, test in results if name == size]
@@ -249,8 +250,11 @@ def _tell_cracks(results: list[tuple[Any, int, Watched]], path: Path | None) -> 
             f"crack of radius {size[0]} mm, opening {size[1]} mm: scores {np.round(best, 1).tolist()}, "
             f"found after {delays} steps{away}"
         )
-        hit = (best[:, None] > limits).mean(axis=0)
-        axes.step((clean[:, None] > limits).mean(axis=0), hit, where="post", label=f"{size[0]} mm, {size[1]} mm")
+        if best.min() > clean.max():
+            at_once += 1
+        else:
+            axes.step(false, (best[:, None] > limits).mean(axis=0), where="post", label=f"{size[0]} mm, {size[1]} mm")
+    axes.step(false, np.ones_like(false), where="post", color=TRUTH["color"], label=f"the {at_once} others")
     axes.set_xlabel(f"false alarms in {FOUND_WITHIN} clean steps (share)")
     axes.set_ylabel("cracks found (share)")
     axes.legend(fontsize="x-small", title="radius, opening")

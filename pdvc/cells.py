@@ -7,7 +7,8 @@ what was seen there,
     m_t(X) = (1 - a) m_(t-1)(X) + a w_t(p_t(X))
 
 is taken over the last few steps, and with a smaller a over many. What the model of the image always misses there is in
-both: their difference, over its own deviation over all cells, tells what is new.
+both: their difference, over its own deviation over all cells, tells what is new. Of a cell that looked as usual a
+radiograph tells `MOST` at most, so that no single one makes a crack.
 
 Rays cross many cells, so that a spot in one residual may lie anywhere along its ray; those of several directions meet
 where it is. Its place is therefore the middle of where much is new over some more steps, at the height of the spot.
@@ -40,6 +41,9 @@ SOON, PLACED, LATE = 1 / 3, 1 / 12, 1 / 30
 """Share of a step in the mean over few steps, over as many as tell a place, and over many."""
 USED_SHARE = 0.3
 """Share of a square of pixels that is used, at least, to count."""
+MOST, TRUST = 5.0, 2.0
+"""Deviations that a radiograph tells of a cell, at most: it may look odd from one direction. And by how many times
+what was new there before this is more."""
 _MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -86,18 +90,21 @@ class Cells:
             return Spot(score=0.0, place_mm=(math.nan, math.nan, math.nan))
         seen, (row, column) = self._summed(residual), self._places(amplitude, angle_rad)
         on = self._inside & (row >= 0) & (column >= 0) & (row < seen.shape[0]) & (column < seen.shape[1])
-        new = np.where(on, seen[np.where(on, row, 0), np.where(on, column, 0)], 0.0)
-        self._means[:2] += np.maximum([[[SOON]], [[PLACED]]], 1 / (self.steps + 1)) * (new - self._means[:2])
+        whole = np.where(on, seen[np.where(on, row, 0), np.where(on, column, 0)], 0.0)
+        most = MOST + TRUST * np.maximum(self._means[0] - self._means[2], 0)
+        new = np.clip(whole, -most, most)
+        share = np.maximum([[[SOON]], [[PLACED]]], 1 / (self.steps + 1))
+        self._means[:2] += share * (np.stack([new, whole]) - self._means[:2])
         soon, placed = self._means[:2] - self._means[2]
         scale = _MAD * float(np.median(np.abs(soon[self._inside])))
-        most = np.unravel_index(int(np.argmax(np.where(self._inside, soon, -np.inf))), soon.shape)
-        score = float(soon[most]) / scale if scale > 0 else 0.0
+        at = np.unravel_index(int(np.argmax(np.where(self._inside, soon, -np.inf))), soon.shape)
+        score = float(soon[at]) / scale if scale > 0 else 0.0
         self._means[2] += max(LATE, 1 / (self.steps + 1)) * (new - self._means[2])
         self.steps += 1
-        layer = int(most[0])
+        layer = int(at[0])
         weight = np.where(self._inside[layer], placed[layer], 0)
         weight = np.maximum(weight - weight.max() / 2, 0)
-        x, y = (self._xy.T @ weight / weight.sum() if weight.any() else self._xy[most[1]]).tolist()
+        x, y = (self._xy.T @ weight / weight.sum() if weight.any() else self._xy[at[1]]).tolist()
         return Spot(score=score, place_mm=(x, y, float(self._z[layer])))
 
     def kept(self) -> dict[str, NDArray[Any]]:

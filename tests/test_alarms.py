@@ -93,9 +93,19 @@ def test_what_was_always_there_is_not_new_and_more_material_is_no_crack():
         assert max(scores[LEAST_USUAL:]) < 8
 
 
+def test_what_a_single_radiograph_shows_is_no_crack():
+    cells = Cells(GEOMETRY, BASIS, HULL)
+    images = dict(residuals(50, 1))
+    for t, image in residuals(50, 1, (0.3, 0.2, 0.5), since=0, height=40.0):
+        if t in (20, 32):
+            images[t] = image
+    scores = [cells.add(image, still(), t * STEP_RAD).score for t, image in images.items()]
+    assert max(scores[LEAST_USUAL:]) < 8
+
+
 def test_a_pixel_that_is_not_finite_and_a_sample_thinner_than_a_cell_do_no_harm():
     cells = Cells(GEOMETRY, BASIS, HULL)
-    for t, image in residuals(20, 3, (0.3, 0.2, 0.5), since=14, height=8.0):
+    for t, image in residuals(20, 3, (0.3, 0.2, 0.5), since=12, height=8.0):
         image[10, 10] = np.nan if t == 5 else image[10, 10]
         spot = cells.add(image, still(), t * STEP_RAD)
     assert spot.score > 8
