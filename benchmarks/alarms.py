@@ -148,11 +148,11 @@ def watched(scenario: Scenario, fault: Fault = arrival, last: int | None = None)
 def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=10, help="clean tests; of each fault a third as many")
+    parser.add_argument("--draws", type=int, default=10, help="clean tests; of each fault a fifth as many")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--figure", type=Path)
     options = parser.parse_args()
-    few = max(options.draws // 3, 1)
+    few = max(options.draws // 5, 1)
     clean, moved = load_scenario("quick"), {name: load_scenario(name) for name in ("slip", "neck")}
     cracked = {(r, d): _crack(r, d) for r in RADII_MM for d in OPENINGS_MM}
     jobs = [("clean", 0, seeded(clean, k), arrival, None) for k in range(options.draws)]

@@ -40,17 +40,14 @@ def main(folder: Path, scenario: str = "quick", pace_s: str = "2") -> None:
         record = Places(file=file).record
         while live.poll() is None and not (record.exists() and record.stat().st_size):
             time.sleep(0.1)
-        if live.returncode:
-            sys.exit(live.returncode)
         url = begin("page", file, stdout=subprocess.PIPE).stdout.readline().strip()
         print(f"the test is shown at {url}", flush=True)
         if os.environ.get("DISPLAY") or sys.platform in ("darwin", "win32"):
             webbrowser.open(url)
         begin("play", experiment, "--to", arriving, "--pace", pace_s)
-        if live.wait():
-            sys.exit(live.returncode)
+        ended = live.wait()
         time.sleep(1)  # that it is over is still to be shown
-        print(f"the test is over; to see it again: pdvc-bench page {file}")
+        sys.exit(ended or print(f"the test is over; to see it again: pdvc-bench page {file}"))
 
 
 if __name__ == "__main__":

@@ -236,12 +236,20 @@ def _fitted(
     deviations: Deviations,
     rounds: int,
 ) -> _Fit:
-    """Return the likeliest process about amplitudes (step, unknown): found with few modes, then followed with all."""
-    data, white = seen(equations, _of_all(noise), amplitude)
-    if rounds:
-        deviations = Process(spaces[0], data).fitted(deviations, rounds)
-    process = Process(spaces[1], data)
-    return _Fit(process=process, deviations=deviations, smoothed=process.smoothed(deviations), white=white)
+    """Return the likeliest process about amplitudes (step, unknown): found with few modes, then followed with all.
+
+    Raises ValueError where none is likely: the radiographs show something else than this sample.
+    """
+    try:
+        data, white = seen(equations, _of_all(noise), amplitude)
+        if rounds:
+            deviations = Process(spaces[0], data).fitted(deviations, rounds)
+        process = Process(spaces[1], data)
+        return _Fit(process=process, deviations=deviations, smoothed=process.smoothed(deviations), white=white)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            f"deformation: expected radiographs that some motion of the sample explains, found none that does: {error}"
+        ) from None
 
 
 def _of_all(noise: Propagated) -> Floats:
