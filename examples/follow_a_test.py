@@ -45,9 +45,10 @@ def main(folder: Path, scenario: str = "quick", pace_s: str = "2") -> None:
         if os.environ.get("DISPLAY") or sys.platform in ("darwin", "win32"):
             webbrowser.open(url)
         begin("play", experiment, "--to", arriving, "--pace", pace_s)
-        ended = live.wait()
-        time.sleep(1)  # that it is over is still to be shown
-        sys.exit(ended or print(f"the test is over; to see it again: pdvc-bench page {file}"))
+        if live.wait() == 0:
+            time.sleep(1)  # that it is over is still to be shown
+            print(f"the test is over; to see it again: pdvc-bench page {file}")
+    sys.exit(live.returncode)
 
 
 if __name__ == "__main__":
