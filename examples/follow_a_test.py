@@ -24,8 +24,7 @@ def main(folder: Path, scenario: str = "quick", pace_s: str = "2") -> None:
     experiment, arriving, ready, file = (folder / name for name in ("experiment", "arriving", "ready", "motion.nc"))
     for old in (*folder.glob("motion.nc*"), *folder.glob("arriving")):
         shutil.rmtree(old) if old.is_dir() else old.unlink()
-    if not (experiment / "experiment.toml").exists():
-        subprocess.run([*BENCH, "simulate", scenario, "-o", experiment], check=True)
+    subprocess.run([*BENCH, "simulate", scenario, "-o", experiment], check=True)
     subprocess.run([*BENCH, "prepare", experiment, "--work", ready], check=True)
     arriving.mkdir()
     with ExitStack() as ends:
@@ -40,10 +39,10 @@ def main(folder: Path, scenario: str = "quick", pace_s: str = "2") -> None:
         record = Places(file=file).record
         while live.poll() is None and not (record.exists() and record.stat().st_size):
             time.sleep(0.1)
-        url = begin("page", file, stdout=subprocess.PIPE).stdout.readline().strip()
-        print(f"the test is shown at {url}", flush=True)
+        url = begin("page", file, stdout=subprocess.PIPE).stdout.readline()
+        print("the test is shown at", url, end="", flush=True)
         if os.environ.get("DISPLAY") or sys.platform in ("darwin", "win32"):
-            webbrowser.open(url)
+            webbrowser.open(url.strip())
         begin("play", experiment, "--to", arriving, "--pace", pace_s)
         if live.wait() == 0:
             time.sleep(1)  # that it is over is still to be shown
