@@ -152,10 +152,8 @@ function eventItem(line) {
   const item = document.createElement("li");
   const alarm = line.what === "alarm";
   item.className = line.what;
-  const place = (line.place_mm ?? []).map((mm, k) => mm !== null && `${"xyz"[k]} ${fixed(mm, 2)}`).filter(Boolean);
-  const where = place.length ? `; at ${place.join(", ")} mm` : "";
   const step = line.step < 0 ? line.file : `step ${line.step}`;
-  tell(item, ["b", alarm ? `⚠ ${line.alarm}` : "lost"], ["span", `${step}: ${line.reason}${where}`]);
+  tell(item, ["b", alarm ? `⚠ ${line.alarm}` : "lost"], ["span", `${step}: ${line.reason}`]);
   if (alarm && pictures.alarms.includes(line.step)) item.append(shots(line.step));
   return item;
 }
