@@ -28,9 +28,11 @@ from pdvc.cells import Cells, Spot
 from pdvc.data_checks import AIR_DOUBT, EDGE_SEEN, SATURATED
 from pdvc.deviations import beam_frame
 from pdvc.examination import StackLook, full_scale, look_at
+from pdvc.geometry import within_half_turn
 from pdvc.incoming import Arrival
 from pdvc.likeness import Beside
 from pdvc.record import AlarmLine, StepLine
+from pdvc.robust import usual_size
 from pdvc.sections import (
     ROTATION_X,
     ROTATION_Y,
@@ -66,8 +68,6 @@ TURNED_VOXEL = 4.0
 """Voxels by which the outline turns from a radiograph to the next, for the two to look different."""
 QUIET = 10
 """Steps after which an alarm that goes on is raised again."""
-_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,8 +202,7 @@ class Watch:
         before, turned = self._before, abs(angle - self._angle_rad)
         outline = self._setup.outline.hull.radius_mm() / self._setup.geometry.voxel_mm
         # a whole turn on, it looks as before
-        away = abs((turned + np.pi) % (2 * np.pi) - np.pi)
-        if before.size and away * outline > TURNED_VOXEL:
+        if before.size and abs(within_half_turn(turned)) * outline > TURNED_VOXEL:
             recorded, was = self._beside.likeness(picture, angle, before, self._angle_rad)
             if was - recorded > STAGE:
                 yield Alarm(
@@ -246,7 +245,7 @@ class Watch:
         past, self._jumps = self._jumps, [*self._jumps[-USUAL + 1 :], jump]
         if len(past) < LEAST_USUAL:
             return
-        usual = _MAD * np.median(np.abs(past), axis=0)
+        usual = usual_size(np.array(past), axis=0)
         score = np.abs(jump) / np.sqrt(usual**2 + np.einsum("mu,uv,mv->m", shown, taken.uncertain, shown))
         most = int(np.argmax(score))
         if score[most] > SUDDEN:
@@ -276,7 +275,7 @@ class Watch:
             return
         part = before * grown.sum() / before.sum()
         excess = grown - part
-        score = excess / max(_MAD * float(np.median(np.abs(excess - np.median(excess)))), 1e-300)
+        score = excess / max(float(usual_size(excess - np.median(excess))), 1e-300)
         most = int(np.argmax(excess))
         if score[most] > LOCAL and excess[most] > LOCAL_SHARE * max(part[most], grown.mean()):
             height = self._setup.sections.height_mm

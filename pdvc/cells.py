@@ -27,6 +27,7 @@ from scipy import ndimage
 
 from pdvc.geometry import ConeBeam
 from pdvc.rays import ray_vectors
+from pdvc.robust import usual_size
 from pdvc.sections import SectionBasis
 from pdvc.volume import Hull
 
@@ -44,8 +45,6 @@ USED_SHARE = 0.3
 MOST, TRUST = 5.0, 2.0
 """Deviations that a radiograph tells of a cell, at most: it may look odd from one direction. And by how many times
 what was new there before this is more."""
-_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +95,7 @@ class Cells:
         share = np.maximum([[[SOON]], [[PLACED]]], 1 / (self.steps + 1))
         self._means[:2] += share * (np.stack([new, whole]) - self._means[:2])
         soon, placed = self._means[:2] - self._means[2]
-        scale = _MAD * float(np.median(np.abs(soon[self._inside])))
+        scale = float(usual_size(soon[self._inside]))
         at = np.unravel_index(int(np.argmax(np.where(self._inside, soon, -np.inf))), soon.shape)
         score = float(soon[at]) / scale if scale > 0 else 0.0
         self._means[2] += max(LATE, 1 / (self.steps + 1)) * (new - self._means[2])
@@ -122,7 +121,7 @@ class Cells:
         mean = ndimage.uniform_filter(residual.astype(float), self._pixels, mode="constant")
         counts = used > USED_SHARE
         summed = np.where(counts, mean / np.sqrt(np.maximum(used, USED_SHARE)), 0)
-        scale = _MAD * float(np.median(np.abs(summed[counts]))) if counts.any() else 0.0
+        scale = float(usual_size(summed[counts])) if counts.any() else 0.0
         return summed / scale if scale > 0 else summed
 
     def _places(self, amplitude: Floats, angle_rad: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -136,8 +135,7 @@ class Cells:
         cells = np.empty((*self._inside.shape, 3))
         cells[..., :2], cells[..., 2] = self._xy, self._z[:, None]
         cells += cells @ maps[..., :3].transpose(0, 2, 1) + maps[:, None, :, 3]
-        vectors = ray_vectors(self._geometry, angle_rad).stacked()[0]
-        source, corner, down, right = vectors
+        source, corner, down, right = ray_vectors(self._geometry, angle_rad).stacked()[0]
         normal, ray = np.cross(down, right), cells - source
         on_panel = source + ray * (((corner - source) @ normal) / (ray @ normal))[..., None] - corner
         row, column = (np.rint(on_panel @ each / (each @ each)).astype(np.int64) for each in (down, right))

@@ -32,7 +32,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +120,16 @@ class ConeBeam:
             column_shift_mm=self.column_shift_mm + c * along_columns - s * along_rows,
             row_shift_mm=self.row_shift_mm + s * along_columns + c * along_rows,
         )
+
+
+def within_half_turn(angle_rad: ArrayLike) -> NDArray[np.float64]:
+    """Return angles less their whole turns, rad: from -pi up to pi."""
+    return np.asarray((np.asarray(angle_rad, dtype=float) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def nearest_angles(angle_rad: NDArray[np.float64], among_rad: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return which (angle,) of some angles, over the turn's end too, each angle is nearest to."""
+    return np.asarray(np.abs(within_half_turn(angle_rad[:, None] - among_rad)).argmin(axis=1))
 
 
 def gaps_rad(turned_rad: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from pdvc.experiment import Experiment
-from pdvc.geometry import ConeBeam
+from pdvc.geometry import ConeBeam, within_half_turn
 from pdvc.radiographs import Calibration, binned, grey_levels
 
 Floats = NDArray[np.float64]
@@ -113,7 +113,7 @@ def likeness(experiment: Experiment, calibration: Calibration) -> Likeness:
         recorded=recorded,
         steps=looked_at,
         best=found.max(axis=1),
-        off_rad=(best - test.angle_rad[looked_at] + np.pi) % (2 * np.pi) - np.pi,
+        off_rad=within_half_turn(best - test.angle_rad[looked_at]),
         spacing_rad=2 * np.pi / len(around),
         upside_down=with_all(test.counts[:, ::-1]).max(axis=1),
         mirrored=with_all(test.counts[:, :, ::-1]).max(axis=1),

@@ -12,6 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.robust import usual_size
+
 Floats = NDArray[np.float64]
 
 LEAVES = 5.0
@@ -32,7 +34,7 @@ def onset(force_N: Floats) -> int | None:
     for first in range(LEAST_PLATEAU, steps - 2):
         plateau = force_N[:first]
         level = float(np.median(plateau))
-        scatter = 1.4826 * float(np.median(np.abs(plateau - level)))
+        scatter = float(usual_size(plateau - level))
         scatter = max(scatter, noise, 1e-6 * float(np.abs(force_N).max()), 1e-12)
         away = np.abs(force_N[first:] - level)
         if (away[:_LINE] > LEAVES * scatter).all() and _one_sided(force_N[first:] - level):
@@ -53,7 +55,7 @@ def force_noise(force_N: Floats) -> float:
     Their variance is sigma^2 (1 + 4 + 1).
     """
     bends = np.diff(force_N, 2)
-    return 1.4826 * float(np.median(np.abs(bends))) / np.sqrt(6) if len(bends) else 0.0
+    return float(usual_size(bends)) / np.sqrt(6) if len(bends) else 0.0
 
 
 def _one_sided(away: Floats) -> bool:

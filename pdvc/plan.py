@@ -27,6 +27,7 @@ from pdvc.deviations import Knowledge, beam_frame
 from pdvc.digest import digest
 from pdvc.equations import STEPS_AT_ONCE, Images, joined, linearise
 from pdvc.experiment import Experiment, Series
+from pdvc.geometry import nearest_angles
 from pdvc.history import time_basis
 from pdvc.noise import BELIEF
 from pdvc.options import MeasureOptions
@@ -165,7 +166,7 @@ class Planner:
         angle_rad = test.angle_rad
         # steps a turn apart see the same
         _, first, turn = np.unique(np.round(angle_rad % (2 * np.pi), 9), return_index=True, return_inverse=True)
-        views = self._nearest(angle_rad[first])
+        views = nearest_angles(angle_rad[first], self._reference_rad)
         images = self._at(angle_rad[first], views)
         still = np.zeros((len(first), *basis.shape))
         task = f"sensitivities at {len(first)} angles, {basis.shape[0]} sections"
@@ -200,11 +201,6 @@ class Planner:
         flats = pile.covariance(self._noise.flat, matrix.shape[1])
         common = (functions @ believed[turn]).ravel()
         return joined(matrix[turn], functions), covariance, flats, np.outer(common, common)
-
-    def _nearest(self, angle_rad: Floats) -> NDArray[np.intp]:
-        """Return the reference views nearest to angles."""
-        apart = np.abs((angle_rad[:, None] - self._reference_rad + np.pi) % (2 * np.pi) - np.pi)
-        return np.asarray(apart.argmin(axis=1))
 
     def _places(self, test: PlannedTest) -> list[tuple[int, int]]:
         """Return where the window's first pixel was before each step moved the sample, as a mean, whole pixels."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pdvc.experiment import FLATS, Experiment, ExperimentError
+from pdvc.robust import OF_MEDIAN
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -81,7 +82,7 @@ def calibrate(experiment: Experiment) -> Calibration:
 
 def _stands_out(image: Floats) -> NDArray[np.bool_]:
     deviation = np.abs(image - ndimage.median_filter(image, size=3))
-    return np.asarray(deviation > 8 * 1.4826 * max(float(np.median(deviation)), 0.5))
+    return np.asarray(deviation > 8 * OF_MEDIAN * max(float(np.median(deviation)), 0.5))
 
 
 def grey_levels(counts: NDArray[np.uint16] | Image, calibration: Calibration) -> Image:

@@ -28,7 +28,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from pdvc.geometry import gaps_rad
+from pdvc.geometry import gaps_rad, within_half_turn
 from pdvc.sections import SectionBasis
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ def views_around(view_rad: Floats, direction_rad: Floats, width_rad: float) -> t
     at = np.mod(direction_rad, 2 * np.pi)
     # the views from half of them before to half of them after
     places = (np.searchsorted(ring, at)[:, None] + np.arange(count) - count // 2) % len(ring)
-    away = np.mod(ring[places] - at[:, None] + np.pi, 2 * np.pi) - np.pi
+    away = within_half_turn(ring[places] - at[:, None])
     # where views are far apart the nearest counts, however far it is
     nearest = np.abs(away).min(axis=1, keepdims=True)
     part = (gaps + np.roll(gaps, 1))[places]

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from pdvc.coherent import by_block, excess
 from pdvc.equations import Equations, linearise
 from pdvc.experiment import Series
+from pdvc.geometry import nearest_angles
 from pdvc.incoming import Arrival
 from pdvc.lagged import Expected, LaggedFilter, Told
 from pdvc.measurement import ResidualTests
@@ -277,14 +278,14 @@ class Tracker:
             return None
         reference, angle = self._setup.experiment.reference, float(planned.angle_rad[step])
         # it will look much like the view from there
-        away = np.abs(np.mod(reference.angle_rad - angle + np.pi, 2 * np.pi) - np.pi)
+        (view,) = nearest_angles(np.array([angle]), reference.angle_rad)
         alike = Arrival(
             step=step,
             file="",
             angle_rad=angle,
             time_s=float(planned.time_s[step]),
             force_N=float(planned.force_N[step]),
-            counts=reference.counts[int(away.argmin())],
+            counts=reference.counts[view],
         )
         pattern = self._pattern.found() if options.remove_pattern else None
         amplitude = (self._known.space.to_amplitude @ self._known.expected(step).mean).reshape(1, *self._basis.shape)

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from pdvc.deviations import points_on_axis
 from pdvc.measurement import Measurement
+from pdvc.onset import force_noise
 from validation.scoring.centre_line import TruePoints, measured_at
 from validation.scoring.scores import Directions
 
@@ -86,10 +87,7 @@ def constant_load_steps(force_N: Floats) -> int:
     force = np.asarray(force_N, dtype=float)
     if not force.any():
         return 0
-    bends = np.abs(np.diff(force, 2))
-    # a second difference of white noise has 1 + 4 + 1 times its variance; 1.4826: from a median to a deviation
-    noise = 1.4826 * float(np.median(bends)) / math.sqrt(6) if bends.size else 0.0
-    noise = max(noise, 1e-9 * float(np.abs(force).max()))
+    noise = max(force_noise(force), 1e-9 * float(np.abs(force).max()))
     count = 1
     while count < len(force):
         away = abs(force[count] - force[:count].mean())
