@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.cells import Cells, Spot
-from pdvc.data_checks import AIR_DOUBT, EDGE_SEEN, SATURATED
+from pdvc.data_checks import AIR_DOUBT, EDGE_SEEN, SATURATED, clips
 from pdvc.deviations import beam_frame
-from pdvc.examination import StackLook, full_scale, look_at
+from pdvc.examination import StackLook, look_at, share_at_top
 from pdvc.geometry import within_half_turn
 from pdvc.incoming import Arrival
 from pdvc.likeness import Beside
@@ -101,9 +101,7 @@ class Watch:
         self._cells = Cells(setup.geometry.cropped(*setup.window), setup.sections, setup.outline.hull)
         some = np.linspace(0, len(setup.experiment.reference) - 1, 24).astype(int)
         reference = look_at(setup.experiment.reference.counts[some], setup.calibration)
-        flats, self._edge = setup.experiment.flats, float(reference.edge.max())
-        # a beam without noise, on a detector without pattern, has one count in most pixels
-        self._clips = float((flats == flats.max()).mean()) < SATURATED
+        self._edge, self._flats_top = float(reference.edge.max()), share_at_top(setup.experiment.flats)
         self.spot: Spot | None = None
         """Where the newest step shows most that is new; None after few steps."""
         self._newest, self._angle_rad = -1, math.nan
@@ -182,7 +180,7 @@ class Watch:
                 reason=f"air has a transmission of {air:.2f} where 1 is due",
                 spoils=lost,
             )
-        if top > SATURATED and (full_scale(look.highest) or self._clips):
+        if top > SATURATED and clips(look.highest, self._flats_top):
             yield Alarm(
                 name="saturation",
                 value=top,

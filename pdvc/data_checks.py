@@ -64,7 +64,7 @@ def check_usable(found: Examination, experiment: Experiment) -> None:
             "count: expose shorter"
         )
     for name, look in found.stacks.items():
-        _check_stack(name, look, clips=_clips(look.highest, found))
+        _check_stack(name, look, clips=clips(look.highest, found.flats_top))
     if found.bad_share > 0.2:
         raise ExperimentError(
             f"{FLATS}: expected nearly all pixels alike, found {found.bad_share:.0%} bad ones: "
@@ -79,12 +79,12 @@ def check_usable(found: Examination, experiment: Experiment) -> None:
         )
 
 
-def _clips(highest: int, found: Examination) -> bool:
-    """Return whether many pixels at the largest count mean that counts are clipped.
+def clips(highest: int, flats_top: float) -> bool:
+    """Return whether many pixels at the largest count mean that counts are clipped; `flats_top` of them in flats.
 
     Not where flats, too, hold one count in most pixels: a beam without noise on a detector without pattern.
     """
-    return full_scale(highest) or found.flats_top < SATURATED
+    return full_scale(highest) or flats_top < SATURATED
 
 
 def _check_stack(name: str, look: StackLook, *, clips: bool) -> None:
@@ -179,7 +179,9 @@ def _of_counts(found: Examination) -> Iterator[Doubt]:
                 advice="the beam changed, or flats and darks are not those of these radiographs",
                 steps=_steps(name, off),
             )
-        clipped = np.flatnonzero(look.at_top > SATURATED) if _clips(look.highest, found) else np.zeros(0, dtype=int)
+        clipped = (
+            np.flatnonzero(look.at_top > SATURATED) if clips(look.highest, found.flats_top) else np.zeros(0, dtype=int)
+        )
         if len(clipped):
             yield Doubt(
                 name="saturation",

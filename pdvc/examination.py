@@ -107,7 +107,7 @@ def examine(experiment: Experiment, *, progress: Progress = silent) -> Examinati
     return Examination(
         calibration=calibration,
         stacks=stacks,
-        flats_top=float((experiment.flats == experiment.flats.max()).mean()),
+        flats_top=share_at_top(experiment.flats),
         flats_full=full_scale(int(experiment.flats.max())),
         bad_share=float(calibration.bad.mean()),
         noise_ratio=_noise_ratio(experiment, calibration),
@@ -169,6 +169,11 @@ def _steepest(transmission: Floats) -> float:
     attenuation = -np.log(np.clip(transmission, 1e-3, None))
     largest = np.maximum(attenuation.max(axis=1), 1e-3)
     return float(np.median(np.abs(np.diff(attenuation, axis=1)).max(axis=1) / largest))
+
+
+def share_at_top(counts: NDArray[np.uint16]) -> float:
+    """Return the share of counts that are the largest of all."""
+    return float((counts == counts.max()).mean())
 
 
 def full_scale(count: int) -> bool:
