@@ -58,15 +58,7 @@ Fault = Callable[[Experiment, int], Arrival]
 
 def arrival(experiment: Experiment, step: int) -> Arrival:
     """Return the radiograph of a step, as it is."""
-    test = experiment.test
-    return Arrival(
-        step=step,
-        file=f"{step:05d}.tif",
-        angle_rad=float(test.angle_rad[step]),
-        time_s=float(test.time_s[step]),
-        force_N=float(test.force_N[step]),
-        counts=np.array(test.counts[step]),
-    )
+    return Arrival.of(experiment.test, step)
 
 
 def dimmed(experiment: Experiment, step: int, share: float) -> Arrival:

@@ -12,14 +12,16 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from pdvc.experiment import Series
 from pdvc.radiograph_table import TABLE, Line, RadiographTable, append_line, begin_table
 from pdvc.stacks import ExperimentError, UnfinishedError, read_radiograph
 from pdvc.whole import write_whole
@@ -38,6 +40,28 @@ class Arrival:
     force_N: float
     counts: NDArray[np.uint16]
     """Counts (row, column), in memory."""
+
+    @classmethod
+    def of(cls, series: Series, step: int, counts: NDArray[np.uint16] | None = None) -> Self:
+        """Return the radiograph of a step of a series that came from no folder, or other counts in its place."""
+        return cls(
+            step=step,
+            file="",
+            angle_rad=float(series.angle_rad[step]),
+            time_s=float(series.time_s[step]),
+            force_N=float(series.force_N[step]),
+            counts=np.array(series.counts[step] if counts is None else counts),
+        )
+
+
+def series_of(arrivals: Sequence[Arrival]) -> Series:
+    """Return the series of some radiographs, at least one."""
+    return Series(
+        counts=np.stack([each.counts for each in arrivals]),
+        angle_rad=np.array([each.angle_rad for each in arrivals]),
+        time_s=np.array([each.time_s for each in arrivals]),
+        force_N=np.array([each.force_N for each in arrivals]),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,8 +26,8 @@ from pdvc.alarms import Alarm, Watch
 from pdvc.compilation import compile_kernels
 from pdvc.deviations import beam_frame, strain_std, turned_std
 from pdvc.digest import digest
-from pdvc.experiment import Experiment, ExperimentError, Series
-from pdvc.incoming import Arrival, Incoming
+from pdvc.experiment import Experiment, ExperimentError
+from pdvc.incoming import Arrival, Incoming, series_of
 from pdvc.lagged import Late, Told
 from pdvc.lock import held
 from pdvc.measurement import Measurement
@@ -201,13 +201,7 @@ class _Follower:
         if gone or not arrived:
             found = f"that of step {listed(gone)} not any more" if gone else "none"
             raise ExperimentError(f"{self._radiographs}: expected the radiographs of the test, found {found}")
-        test = Series(
-            counts=np.stack([each.counts for each in arrived]),
-            angle_rad=np.array([each.angle_rad for each in arrived]),
-            time_s=np.array([each.time_s for each in arrived]),
-            force_N=np.array([each.force_N for each in arrived]),
-        )
-        return replace(self._setup.experiment, test=test)
+        return replace(self._setup.experiment, test=series_of(arrived))
 
     def _opened(self, done: Iterable[int]) -> Incoming:
         geometry = self._setup.geometry

@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 
 from pdvc.coherent import by_block, excess
 from pdvc.equations import Equations, linearise
-from pdvc.experiment import Series
 from pdvc.geometry import nearest_angles
-from pdvc.incoming import Arrival
+from pdvc.incoming import Arrival, series_of
 from pdvc.lagged import Expected, LaggedFilter, Told
 from pdvc.measurement import ResidualTests
 from pdvc.noise import (
@@ -205,12 +204,7 @@ class Tracker:
 
     def _images(self, radiograph: Arrival, pattern: Pattern | None) -> Callable[[int], Prepared]:
         """Return the function that gives a radiograph at a scale, prepared when it is first asked for."""
-        alone = Series(
-            counts=radiograph.counts[None],
-            angle_rad=np.array([radiograph.angle_rad]),
-            time_s=np.array([radiograph.time_s]),
-            force_N=np.array([radiograph.force_N]),
-        )
+        alone = series_of([radiograph])
 
         @cache
         def at(scale: int) -> Prepared:
@@ -276,17 +270,10 @@ class Tracker:
         planned, options = self._setup.experiment.test, self._setup.options
         if step >= len(planned) or options.weighting == "noise":
             return None
-        reference, angle = self._setup.experiment.reference, float(planned.angle_rad[step])
+        reference = self._setup.experiment.reference
         # it will look much like the view from there
-        (view,) = nearest_angles(np.array([angle]), reference.angle_rad)
-        alike = Arrival(
-            step=step,
-            file="",
-            angle_rad=angle,
-            time_s=float(planned.time_s[step]),
-            force_N=float(planned.force_N[step]),
-            counts=reference.counts[view],
-        )
+        (view,) = nearest_angles(planned.angle_rad[step : step + 1], reference.angle_rad)
+        alike = Arrival.of(planned, step, reference.counts[view])
         pattern = self._pattern.found() if options.remove_pattern else None
         amplitude = (self._known.space.to_amplitude @ self._known.expected(step).mean).reshape(1, *self._basis.shape)
         try:

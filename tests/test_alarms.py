@@ -137,12 +137,8 @@ def setup(experiment, tmp_path_factory) -> Setup:
 
 
 def arrival(experiment: Experiment, step: int, counts=None) -> Arrival:
-    test = experiment.test
-    found = test.counts[step] if counts is None else counts
-    angle, time, force = (float(each[step]) for each in (test.angle_rad, test.time_s, test.force_N))
-    return Arrival(
-        step=step, file="", angle_rad=angle, time_s=time, force_N=force, counts=np.array(found, dtype=np.uint16)
-    )
+    found = None if counts is None else np.array(counts, dtype=np.uint16)
+    return Arrival.of(experiment.test, step, found)
 
 
 def names(alarms) -> list[str]:
