@@ -134,23 +134,23 @@ class LaggedFilter:
         gain = np.linalg.solve(np.eye(len(spread)) + spread @ information, spread)
         return to @ (expected.mean + gain @ left), to @ gain @ to.T
 
-    def add(self, step: int, told: Told, *, slips: bool = True) -> None:
+    def add(self, step: int, told: Told, expected: Expected | None = None) -> None:
         """Take in what the radiograph of a step told; raises Late where it is more than `LAG` steps ago.
 
-        `slips`: whether what is far from what was expected is a motion at once. The steps after it tell, otherwise,
-        whether it was one, or what the model of the image misses.
+        What is far from what was `expected` of it is a motion at once. Without, the steps after it tell whether it was
+        one, or what the model of the image misses.
         """
-        expected = self.expected(step)
+        self._take_over(max(self.steps, step + 1))
+        self._after(step)
         self._told[step] = told
         self._passed = self._passed[: step - self._first + 1]
         self.steps = max(self.steps, step + 1)
-        self._take_over(self.steps)
         if self._finds:
             window = slice(max(self.steps - WINDOW, 0), self.steps)
             process, given = self._process(window, self._about(), self._told), self._given(window)
             # nothing was known of a step before its radiograph
             given.misfit[step - window.start] = 1
-            if slips and step + 1 == self.steps and step - window.start >= 2:
+            if expected is not None and step + 1 == self.steps and step - window.start >= 2:
                 last = step - window.start - 2
                 information, vector = self._informed(step, misfit=1.0)
                 found = self._scales(expected, information, vector[:, 0] - information @ expected.mean)

@@ -165,7 +165,7 @@ class Tracker:
         told = self._told_by(self._awaited, amplitude, equations, noise.step(0))
         rms = equations.rms
         usual = float(np.median(self._rms)) if len(self._rms) >= LEAST_USUAL else 0.0
-        self._known.add(radiograph.step, told, slips=rms < EXPLAINED * usual)
+        self._known.add(radiograph.step, told, expected if rms < EXPLAINED * usual else None)
         self._rms = [*self._rms[1 - USUAL :], rms]
         found, covariance = self._known.at(radiograph.step)
         if pattern is not None:

@@ -83,7 +83,7 @@ def test_each_step_is_that_of_a_smoother_of_the_steps_so_far_in_any_order_and_wi
     arriving = data.draw(st.permutations(range(steps)))[: data.draw(st.integers(1, steps))]
     known, given_so_far = tracker(steps), {}
     for step, each in zip(arriving, told(rng, motion(rng, len(arriving))), strict=True):
-        known.add(step, each)
+        known.add(step, each, known.expected(step))
         given_so_far[step] = each
     newest = max(given_so_far)
     mean, covariance = known.at(newest)
@@ -99,8 +99,8 @@ def test_errors_in_common_do_to_the_motion_what_they_do_as_data(seed, steps):
     data = told(rng, motion(rng, steps))
     known, wrong = tracker(steps), tracker(steps)
     for step, each in enumerate(data):
-        known.add(step, each)
-        wrong.add(step, replace(each, data=each.data + each.errors[:, 1]))
+        known.add(step, each, known.expected(step))
+        wrong.add(step, replace(each, data=each.data + each.errors[:, 1]), wrong.expected(step))
     mean, change = known.at(steps - 1)[0], wrong.at(steps - 1)[0][:, 0]
     np.testing.assert_allclose(mean[:, 2], change - mean[:, 0], atol=1e-7 * max(np.abs(mean).max(), 1))
 
@@ -111,7 +111,7 @@ def test_a_pass_is_weighed_against_what_is_expected_as_two_gaussians_are(seed, s
     rng = np.random.default_rng(seed)
     data, known = told(rng, motion(rng, step + 1)), tracker(6)
     for t in range(step):
-        known.add(t, data[t])
+        known.add(t, data[t], known.expected(t))
     expected = known.expected(step)
     matrix, vector = data[step].design.T @ data[step].design, data[step].design.T @ data[step].data
     mean, covariance = known.weighed(expected, matrix, vector)
@@ -135,7 +135,7 @@ def test_gone_on_with_it_finds_the_same_to_the_last_digit(killed, monkeypatch):
     data = told(rng, motion(rng, steps))
     whole, kept = tracker(steps, "fit"), {}
     for step, each in enumerate(data):
-        whole.add(step, each)
+        whole.add(step, each, whole.expected(step))
         if step + 1 == killed:
             kept = {name: np.array(values) for name, values in whole.kept().items()}
         whole.fit()
@@ -144,7 +144,7 @@ def test_gone_on_with_it_finds_the_same_to_the_last_digit(killed, monkeypatch):
     again.restore(kept, dict(enumerate(data[: killed + 1])))
     again.fit()
     for step in range(killed, steps):
-        again.add(step, data[step])
+        again.add(step, data[step], again.expected(step))
         again.fit()
     for one, other in zip(whole.at(steps - 1), again.at(steps - 1), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -158,12 +158,12 @@ def test_a_fit_that_is_begun_again_rests_on_what_was_told_when_it_began(monkeypa
     whole, again = tracker(12, "fit"), tracker(12, "fit")
     # it is begun after step 5, before step 4 has come
     for step in order[:7]:
-        whole.add(step, data[step])
+        whole.add(step, data[step], whole.expected(step))
         whole.fit()
     again.restore({name: np.array(values) for name, values in whole.kept().items()}, dict(enumerate(data)))
     for step in order[7:]:
         for each in (whole, again):
-            each.add(step, data[step])
+            each.add(step, data[step], each.expected(step))
             each.fit()
     for one, other in zip(whole.at(11), again.at(11), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -181,7 +181,7 @@ def test_a_slip_is_followed_in_the_radiograph_that_shows_it():
             expected = known.expected(step)
             mean, _ = known.weighed(expected, each.design.T @ each.design, each.design.T @ each.data)
             np.testing.assert_allclose(mean, truth[step], atol=0.15)
-        known.add(step, each)
+        known.add(step, each, known.expected(step))
         mean, covariance = known.at(step)
         assert np.abs((mean[:, 0] - truth[step]) / np.sqrt(np.diag(covariance))).max() < 5
     assert steps == known.steps
@@ -192,7 +192,7 @@ def test_a_step_far_behind_comes_too_late(monkeypatch):
     rng = np.random.default_rng(0)
     data, known = told(rng, motion(rng, 8)), tracker(8)
     for step in (0, 1, 3, 4, 5, 6):
-        known.add(step, data[step])
+        known.add(step, data[step], known.expected(step))
     known.add(4, data[4])
     known.add(3, data[3])
     for asked in (lambda: known.add(2, data[2]), lambda: known.expected(2)):
