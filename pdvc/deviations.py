@@ -65,7 +65,9 @@ def step_covariance(covariance: Floats, time_functions: Floats, step: int) -> Fl
     """Return the covariance (unknown, unknown), voxel^2, of one step's amplitudes, from that of all coefficients."""
     sigma = time_functions[:, step]
     if covariance.ndim == 3:
-        return np.asarray(np.tensordot(sigma**2, covariance, axes=1))
+        # mostly one function: to multiply all others by zero takes the time of reading them
+        own = np.flatnonzero(sigma)
+        return np.asarray(np.tensordot(sigma[own] ** 2, covariance[own], axes=1))
     functions = len(sigma)
     blocks = covariance.reshape(functions, -1, functions, len(covariance) // functions)
     return np.asarray(np.einsum("f,fngm,g->nm", sigma, blocks, sigma, optimize=True))

@@ -39,7 +39,7 @@ from pdvc.progress import Progress, silent
 from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import noise_overlap, smoothed
 from pdvc.sections import SectionBasis
-from pdvc.sensitivity_sums import Pile, adjoint, overlaid, product, spread
+from pdvc.sensitivity_sums import Pile, Rows, Spread, adjoint, product, summed
 from pdvc.systematic import Sight, Systematic, taps
 from pdvc.volume import Volume
 
@@ -140,9 +140,9 @@ def propagate(
     own = {name: np.empty((len(amplitude), unknowns, unknowns)) for name in SOURCES}
     pairs: dict[tuple[int, int], Floats] = {}
     believed = np.zeros((len(amplitude), unknowns))
-    pile = None if apart else Pile(noise.flat.shape, time_functions, basis.shape[1])
+    pile = None if apart else Pile(time_functions)
     sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
-    held: dict[int, Sensitivities] = {}
+    held: dict[int, Spread] = {}
 
     def add_step(step: int, weighted: Sensitivities, left: Image | None) -> StepNoise:
         """Add what the step's own noise does; return what its views' noise and the flats' meet."""
@@ -158,12 +158,15 @@ def propagate(
         """Return what the noise of the views does that two steps both look along."""
         step, other, shares = pair
         variance = np.sum([share * noise.view(view).variance for view, share in shares.items()], axis=0)
-        return product(held[step], held[other], variance, unknowns)
+        one, two, result = held[step], held[other], np.zeros((unknowns, unknowns))
+        for band in one.bands:
+            one.moved(band).add_product(two.moved(band, "other"), variance[one.rows(band)], result)
+        return result
 
     company = _company(sight, apart)
     order = list(company)
     # rays are walked by all threads at once; what follows is one thread's work for each step. No more steps at a time
-    # than threads: the sensitivities of each are kept, in the window and over the detector
+    # than threads: the sensitivities of each are kept
     at_once = numba.get_num_threads()
     with ThreadPoolExecutor(at_once) as pool:
         for done in range(0, len(order), at_once):
@@ -171,9 +174,9 @@ def propagate(
             fields = weighted_sensitivities(images, basis, amplitude, steps)
             left = [registered_left(images, basis, amplitude, t) for t in steps]
             for t, found in zip(steps, pool.map(add_step, steps, fields, left), strict=True):
-                held[t] = found.moved
+                held[t] = found.spread
                 if pile is not None:
-                    pile.add(t, found.shared, pool)
+                    pile.add(t, found.spread.bands, found.shared, pool)
             together = [(t, other, shares) for t in steps for other, shares in company[t].items()]
             # in this order, whichever is ready first: sums over pairs are to have the same bits
             for (t, other, _), joint in zip(together, pool.map(joint_of, together), strict=True):
@@ -199,12 +202,8 @@ class StepNoise:
     """Of the radiograph, over the window."""
     view: ImageNoise
     """Of the mean of the reference views that it looks along, over the whole detector."""
-    weighted: Sensitivities
-    """W S, in the window."""
-    moved: Sensitivities
-    """Y = R^T W S, over the whole detector."""
-    shared: Sensitivities
-    """s_f Y - s_t W S, which an error of the flats meets, over the whole detector."""
+    spread: Spread
+    """W S in the window, and Y = R^T W S over the whole detector."""
 
     @classmethod
     def of(
@@ -215,37 +214,37 @@ class StepNoise:
         weighted: Sensitivities,
         places: Floats,
         corner: tuple[int, int],
-        pool: Executor | None = None,
     ) -> StepNoise:
-        """Work out what the noise of a step meets; `shares` of its views, `places` of `Systematic.places`.
+        """Tell what the noise of a step meets; `shares` of its views, `places` of `Systematic.places`."""
+        shape = (noise.flat.shape[0], noise.flat.shape[1])
+        spread = Spread(weighted=weighted, places=places, corner=corner, shape=shape)
+        return cls(image=noise.step(step), view=mean_of_views(noise, shares), spread=spread)
 
-        With a pool, halves of the images side by side.
+    def shared(self, band: int, moved: Rows | None = None) -> Rows:
+        """Return s_f Y - s_t W S, which an error of the flats meets, in a band of rows of the detector."""
+        moved = self.spread.moved(band) if moved is None else moved
+        return self.spread.shared(band, moved, self.view.slope, self.image.slope)
+
+    def own(self, flat: Image, unknowns: int) -> dict[str, Floats]:
+        """Return V of the step alone, by `SOURCES`, for a variance of the mean flat (row, column)."""
+        weighted = self.spread.weighted
+        of_radiograph = product(weighted, weighted, self.image.variance, unknowns)
+        return {"radiographs": of_radiograph, **self.of_scan(flat, unknowns)}
+
+    def of_scan(self, flat: Image, unknowns: int, pool: Executor | None = None) -> dict[str, Floats]:
+        """Return V of the step alone that comes of the reference scan, views and flats.
+
+        With a pool, halves of the detector side by side, to other last digits.
         """
-        image, view = noise.step(step), mean_of_views(noise, shares)
-        moved = spread(weighted, places, noise.flat.shape, pool)
-        both = [(moved, view.slope, (0, 0)), (weighted, -image.slope, corner)]
-        shared = overlaid(both, noise.flat.shape, pool)
-        return cls(image=image, view=view, weighted=weighted, moved=moved, shared=shared)
 
-    def own(
-        self, flat: Image, unknowns: int, sources: Sequence[str] = SOURCES, pool: Executor | None = None
-    ) -> dict[str, Floats]:
-        """Return V of the step alone, by some of `SOURCES`, for a variance of the mean flat (row, column).
+        def add(band: int, found: Floats) -> None:
+            rows, moved = self.spread.rows(band), self.spread.moved(band)
+            moved.add_product(moved, self.view.variance[rows], found[0])
+            shared = self.shared(band, moved)
+            shared.add_product(shared, flat[rows], found[1])
 
-        With a pool, sources side by side.
-        """
-        met = {
-            "radiographs": (self.weighted, self.image.variance),
-            "views": (self.moved, self.view.variance),
-            "flats": (self.shared, flat),
-        }
-
-        def of_source(source: str) -> Floats:
-            field, variance = met[source]
-            return product(field, field, variance, unknowns)
-
-        found = map(of_source, sources) if pool is None else pool.map(of_source, sources)
-        return dict(zip(sources, found, strict=True))
+        views, flats = summed(self.spread.bands, unknowns, add, 2, pool)
+        return {"views": views, "flats": flats}
 
 
 def meeting_noise(volume: Volume, smooth_px: float) -> Volume:
@@ -295,7 +294,7 @@ def weighted_sensitivities(
     rays, there = images.rays[steps], amplitude[steps]
     fields = sensitivities(images.volume, rays, shape, basis, there, voxel_mm=images.voxel_mm)
     for t, field in zip(steps, fields, strict=True):
-        field.values[:] *= images.weight[t % len(images.weight)][..., None]
+        field.values[:] *= images.weight[t % len(images.weight)][:, None]
     return fields
 
 

@@ -29,7 +29,7 @@ from pdvc.equations import STEPS_AT_ONCE, Images, joined, linearise
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import nearest_angles
 from pdvc.history import time_basis
-from pdvc.noise import BELIEF
+from pdvc.noise import BELIEF, StepNoise
 from pdvc.options import MeasureOptions
 from pdvc.pattern import left_of_flats
 from pdvc.preparation import prepare, stated_noise
@@ -38,7 +38,7 @@ from pdvc.projection import Sensitivities, sensitivities
 from pdvc.radiographs import noise_overlap, smoothed
 from pdvc.rays import ray_vectors
 from pdvc.sections import SectionBasis
-from pdvc.sensitivity_sums import Pile, adjoint, overlaid, product
+from pdvc.sensitivity_sums import Pile, Spread, adjoint, product
 from pdvc.setup import set_up
 from pdvc.uncertainty import sandwich
 
@@ -172,7 +172,7 @@ class Planner:
         task = f"sensitivities at {len(first)} angles, {basis.shape[0]} sections"
         matrix = linearise(images, basis, still, progress=self._progress, task=task).matrix
         was = self._places(test)
-        pile, noise = Pile(self._noise.flat.shape, functions, basis.shape[1]), np.empty_like(matrix)
+        pile, noise = Pile(functions), np.empty_like(matrix)
         believed = np.zeros(matrix.shape[:2])
         # all steps at one angle have the noise of its view in common, and so have angles with the same view
         shared = np.stack([functions[:, turn == k].sum(axis=1) for k in range(len(first))], axis=1)
@@ -194,13 +194,21 @@ class Planner:
             else:
                 del alike[view]
             for t in np.flatnonzero(turn == k):
-                moved = [(field, -step.slope, self._systematic.corner), (field, step.slope, was[t])]
-                pile.add(int(t), overlaid(moved, self._noise.flat.shape))
+                spread = self._spread(field, was[t])
+                seen_by_flats = StepNoise(image=step, view=self._noise.view(view), spread=spread)
+                pile.add(int(t), spread.bands, seen_by_flats.shared)
         of_steps, of_views = joined(noise[turn], functions), joined(noise, shared)
         covariance = of_steps + of_views + between.reshape(of_views.shape)
         flats = pile.covariance(self._noise.flat, matrix.shape[1])
         common = (functions @ believed[turn]).ravel()
         return joined(matrix[turn], functions), covariance, flats, np.outer(common, common)
+
+    def _spread(self, field: Sensitivities, first_pixel: tuple[int, int]) -> Spread:
+        """Return W S where it is, and moved by whole pixels."""
+        systematic = self._systematic
+        places = np.ones((*systematic.shape, 3))
+        places[..., :2] = np.indices(systematic.shape).transpose(1, 2, 0) + np.array(first_pixel)
+        return Spread(weighted=field, places=places, corner=systematic.corner, shape=systematic.detector)
 
     def _places(self, test: PlannedTest) -> list[tuple[int, int]]:
         """Return where the window's first pixel was before each step moved the sample, as a mean, whole pixels."""
@@ -234,7 +242,7 @@ class Planner:
             found = sensitivities(volume, rays, shape, basis, still, voxel_mm=images.voxel_mm)
             for k, field in enumerate(found):
                 weight = images.weight[(start + k) % len(images.weight)]
-                yield replace(field, values=field.values * weight[..., None])
+                yield replace(field, values=field.values * weight[:, None])
 
 
 def weakest(known: Knowledge, point_mm: Floats, prior_voxel: float, count: int) -> tuple[WeakMotion, ...]:

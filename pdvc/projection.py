@@ -85,7 +85,7 @@ class Sensitivities:
     """S_i of every pixel of one step, for the sections that its row may touch: the others' are zero."""
 
     values: Image
-    """S (row, column, section of the row * motion), grey levels per voxel."""
+    """S (row, section of the row * motion, column), grey levels per voxel."""
     first: NDArray[np.int64]
     """(row,) the section that `values` starts with; sections beyond the last are zero."""
     motions: int
@@ -176,7 +176,9 @@ def _walk(
         vectors=np.zeros((*low.shape, -(-target.shape[2] // BLOCK_COLUMNS), size)),
         chi2=np.zeros(low.shape),
         residual=np.empty(target.shape, dtype=np.float32),
-        kept=np.zeros((*target.shape, size) if fields is not None else (steps, 0, 0, 0), dtype=np.float32),
+        kept=np.zeros(
+            (*target.shape[:2], size, target.shape[2]) if fields is not None else (steps, 0, 0, 0), dtype=np.float32
+        ),
     )
     of_steps = Steps(box=boxes, rays=index_rays, maps=maps, target=target, weight=weight, low=low)
     walk_bands(scene, of_steps, sums, with_sensitivities)

@@ -1,17 +1,23 @@
 """Sums over pixels of sensitivities: what an image or a variance does to the right-hand side of the equations.
 
-A field of sensitivities S(p) is known in the window of a step; what noise meets lies on the whole detector: S itself
-in its place, R^T S where a reference view was moved (`pdvc.systematic`), and sums of both over steps.
+Noise meets the sensitivities W S(p) of a step in the window of its radiograph, and, where a reference view was moved
+with the sample (`pdvc.systematic`), Y = R^T W S on the whole detector. An error of the mean flat meets both, s_f Y in
+the view and -s_t W S in the radiograph.
+
+Fields are (row, section * motion, column): every kernel here does one thing for neighbouring columns, which become
+the processor's vectors. Y of a whole detector would be moved to and from memory for each sum: it is made band by
+band of rows instead, for all sums, while it lies in the cache.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable
 from concurrent.futures import Executor
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pdvc.apart import apart
@@ -21,247 +27,371 @@ from pdvc.systematic import first_pixel, keys_weights
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-_BLOCK_ROWS = 16
+BAND_ROWS = 16
+"""Rows of the detector that are worked on at once."""
 
 
 def product(one: Sensitivities, other: Sensitivities, variance: Image, unknowns: int) -> Floats:
     """Return sum_p one(p)^T v(p) other(p), (unknown, unknown), of two fields with variances v (row, column)."""
     result = np.zeros((unknowns, unknowns))
     offsets = one.first * one.motions, other.first * other.motions
-    _add_product(one.values, offsets[0], other.values, offsets[1], variance, result)
-    return result
+    _add_product(one.values, offsets[0], other.values, offsets[1], variance, one is other, result)
+    return _whole(result) if one is other else result
 
 
 def adjoint(field: Sensitivities, image: Image, unknowns: int) -> Floats:
     """Return sum_p field(p) image(p), (unknown,)."""
-    of_rows = np.einsum("rck,rc->rk", field.values, image, dtype=float)
+    of_rows = np.einsum("rkc,rc->rk", field.values, image, dtype=float)
     # the last sections may have room beyond
-    found = np.zeros(unknowns + field.values.shape[2])
+    found = np.zeros(unknowns + field.values.shape[1])
     for first, row in zip(field.first * field.motions, of_rows, strict=True):
         found[first : first + len(row)] += row
     return found[:unknowns]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """A field in a band of rows of the detector."""
+
+    values: Image
+    """(row, entry, column)"""
+    first: int
+    """The unknown of the first entry; entries beyond the last unknown are zero."""
+
+    def add_product(self, other: Rows, variance: Image, out: Floats) -> None:
+        """Add sum_p self(p)^T v(p) other(p) to `out` (unknown, unknown): with itself, its lower triangle."""
+        starts = (np.full(len(self.values), each.first) for each in (self, other))
+        _add_product(self.values, next(starts), other.values, next(starts), variance, self is other, out)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """W S of a step, and Y = R^T W S, over a detector of `shape`."""
+
+    weighted: Sensitivities
+    """W S (row, section * motion, column), in the window."""
+    places: Floats
+    """Where e is taken for each pixel of the window, and a factor (row, column, 3): `Systematic.places`."""
+    corner: tuple[int, int]
+    """The window's first pixel."""
+    shape: tuple[int, int]
+    """Rows and columns of the detector."""
+
+    @property
+    def bands(self) -> range:
+        """Return the bands of rows of the detector."""
+        return range((self.shape[0] - 1) // BAND_ROWS + 1)
+
+    def rows(self, band: int) -> slice:
+        """Return the rows of a band."""
+        return slice(band * BAND_ROWS, min((band + 1) * BAND_ROWS, self.shape[0]))
+
+    def moved(self, band: int, room: str = "moved") -> Rows:
+        """Return Y in a band of rows: what each pixel of the detector takes part in.
+
+        It lasts until the thread asks for another one in the same room.
+        """
+        rows = self.rows(band)
+        from_rows = (self._reach[:, 0] < rows.stop) & (self._reach[:, 1] >= rows.start)
+        out = self._blank(room, np.flatnonzero(from_rows), rows)
+        offset = self._first - out.first
+        _scatter(
+            self.weighted.values, offset, self._filled, self.places, from_rows, rows.start, self.shape[0], out.values
+        )
+        return out
+
+    def shared(self, band: int, moved: Rows, view_slope: Image, image_slope: Image) -> Rows:
+        """Return s_f Y - s_t W S in a band of rows: what an error of the flats meets.
+
+        Of the slopes s_f is given over the detector, s_t over the window. It lasts until the thread asks for another
+        one.
+        """
+        rows, (row, column) = self.rows(band), self.corner
+        own = np.arange(max(rows.start - row, 0), min(max(rows.stop - row, 0), len(self._first)))
+        out = self._blank("shared", own, rows, moved)
+        at = moved.first - out.first
+        np.multiply(moved.values, view_slope[rows, None], out=out.values[:, at : at + moved.values.shape[1]])
+        offset = self._first - out.first
+        _subtract(self.weighted.values, offset, self._filled, image_slope, own, row - rows.start, column, out.values)
+        return out
+
+    def _blank(self, room: str, own: NDArray[np.int64], rows: slice, beside: Rows | None = None) -> Rows:
+        """Return zeros in a band of rows, for the unknowns that some rows of the window see, and another field."""
+        own = own[self._filled[own, 1] > 0]
+        low, high = self._first[own] + self._filled[own, 0], self._first[own] + self._filled[own, 1]
+        if beside is not None:
+            low, high = np.append(low, beside.first), np.append(high, beside.first + beside.values.shape[1])
+        first, end = (int(low.min()), int(high.max())) if len(low) else (0, 0)
+        return Rows(values=_zeros(room, (rows.stop - rows.start, end - first, self.shape[1])), first=first)
+
+    @cached_property
+    def _first(self) -> NDArray[np.int64]:
+        """The first unknown of each row of the window (row,)."""
+        return self.weighted.first * self.weighted.motions
+
+    @cached_property
+    def _filled(self) -> NDArray[np.int64]:
+        """First and last entry, and column, of a row of the window that is not zero (row, 4); the last is left out."""
+        filled = np.zeros((len(self._first), 4), dtype=np.int64)
+        _find_filled(self.weighted.values, filled)
+        return filled
+
+    @cached_property
+    def _reach(self) -> NDArray[np.int64]:
+        """First and last row of the detector that a row of the window was interpolated from (row, 2)."""
+        rows = np.clip(np.floor(self.places[..., 0]).astype(np.int64), 0, self.shape[0] - 2)
+        first, last = np.maximum(rows.min(axis=1) - 1, 0), np.minimum(rows.max(axis=1) + 2, self.shape[0] - 1)
+        return np.stack([first, last], axis=1)
+
+
+class _Rooms(threading.local):
+    """Memory of each thread in which fields are made again and again: to get it anew would take longer."""
+
+    def __init__(self) -> None:
+        self.of: dict[str, Image] = {}
+
+
+_rooms = _Rooms()
+
+
+def _zeros(room: str, shape: tuple[int, int, int]) -> Image:
+    """Return zeros, in the place of those that were made in this room before."""
+    size, memory = int(np.prod(shape)), _rooms.of.get(room)
+    if memory is None or memory.size < size:
+        memory = _rooms.of[room] = np.empty(size, dtype=np.float32)
+    found = memory[:size].reshape(shape)
+    found[:] = 0
+    return found
+
+
+def summed(
+    bands: range, unknowns: int, add: Callable[[int, Floats], None], count: int = 1, pool: Executor | None = None
+) -> Floats:
+    """Return what `add` adds, band by band, to the lower triangles of `count` matrices (count, unknown, unknown).
+
+    With a pool, halves of the bands side by side, to other last digits.
+    """
+
+    def some(part: range) -> Floats:
+        found = np.zeros((count, unknowns, unknowns))
+        for band in part:
+            add(band, found)
+        return found
+
+    half = len(bands) // 2
+    found = some(bands) if pool is None else np.sum(list(pool.map(some, (bands[:half], bands[half:]))), axis=0)
+    return np.stack([_whole(each) for each in found])
+
+
+def _whole(lower: Floats) -> Floats:
+    """Return a symmetric matrix by its lower triangle."""
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+
+
 class Pile:
     """The sums z = sum_t sigma(t) (x) field(t) in each pixel of the detector: what a noise meets that all share."""
 
-    def __init__(self, shape: tuple[int, ...], time_functions: Floats, motions: int) -> None:
-        """Begin with nothing on a detector of `shape`, for time functions (function, step)."""
-        self._shape = shape
+    def __init__(self, time_functions: Floats) -> None:
+        """Begin with nothing, for time functions (function, step)."""
         self._functions = time_functions.astype(np.float32)
-        self._motions = motions
-        self._first: dict[int, int] = {}
-        self._blocks: dict[int, Image] = {}
+        self._bands: dict[int, Rows] = {}
+        """Of each band (row, function, entry, column)."""
 
-    def add(self, step: int, field: Sensitivities, pool: Executor | None = None) -> None:
-        """Add a step's field over the detector; with a pool, blocks of rows side by side."""
+    def add(self, step: int, bands: range, field: Callable[[int], Rows], pool: Executor | None = None) -> None:
+        """Add the field of a step, band by band of the detector; with a pool, bands side by side."""
 
-        def add_block(block: int) -> None:
-            rows = slice(block * _BLOCK_ROWS, min((block + 1) * _BLOCK_ROWS, len(field.values)))
-            z, first = self._room_for(block, field, rows)
-            offset = (field.first[rows] - first) * self._motions
-            _pile_up(z, field.values[rows], offset, self._functions[:, step])
+        def add_band(band: int) -> None:
+            part = field(band)
+            z = self._room_for(band, part)
+            _pile_up(z.values, part.values, part.first - z.first, self._functions[:, step])
 
-        blocks = range((len(field.values) - 1) // _BLOCK_ROWS + 1)
-        for _ in (map if pool is None else pool.map)(add_block, blocks):
+        for _ in (map if pool is None else pool.map)(add_band, bands):
             pass
 
-    def _room_for(self, block: int, field: Sensitivities, rows: slice) -> tuple[Image, int]:
-        """Return a block of pixels (row, column, function, section * motion), wide enough, and its first section."""
-        span = field.values.shape[2] // self._motions
-        low, high = int(field.first[rows].min()), int(field.first[rows].max()) + span
-        if block not in self._blocks:
-            shape = (_BLOCK_ROWS, self._shape[1], len(self._functions), (high - low) * self._motions)
-            self._blocks[block], self._first[block] = np.zeros(shape, dtype=np.float32), low
-        z, first = self._blocks[block], self._first[block]
-        below, above = max(first - low, 0), max(high - first - z.shape[3] // self._motions, 0)
-        if below or above:
-            z = np.pad(z, ((0, 0),) * 3 + ((below * self._motions, above * self._motions),))
-            self._blocks[block], self._first[block] = z, first - below
-        return self._blocks[block], self._first[block]
+    def _room_for(self, band: int, part: Rows) -> Rows:
+        """Return the sums of a band (row, function, entry, column), wide enough for another field."""
+        rows, room, columns = part.values.shape
+        z = self._bands.get(band)
+        if z is None:
+            z = Rows(values=np.zeros((rows, len(self._functions), room, columns), np.float32), first=part.first)
+        elif room:
+            below = max(z.first - part.first, 0)
+            above = max(part.first + room - z.first - z.values.shape[2], 0)
+            if below or above:
+                values = np.pad(z.values, ((0, 0), (0, 0), (below, above), (0, 0)))
+                z = Rows(values=values, first=z.first - below)
+        self._bands[band] = z
+        return z
 
     def covariance(self, variance: Image, unknowns: int) -> Floats:
         """Return sum_p v(p) z(p) z(p)^T (function * unknown, function * unknown)."""
         functions = len(self._functions)
         total = np.zeros((functions, unknowns, functions, unknowns))
         # from the top down, whichever a pool began with: the sum is to have the same bits
-        for block, z in sorted(self._blocks.items()):
-            rows = slice(block * _BLOCK_ROWS, min((block + 1) * _BLOCK_ROWS, self._shape[0]))
-            flat = (z[: rows.stop - rows.start] * np.sqrt(variance[rows])[..., None, None]).reshape(-1, z[0, 0].size)
+        for band, z in sorted(self._bands.items()):
+            size = min(z.values.shape[2], unknowns - z.first)
+            root = np.sqrt(variance[band * BAND_ROWS : band * BAND_ROWS + len(z.values)])
+            flat = (z.values[:, :, :size] * root[:, None, None]).transpose(1, 2, 0, 3).reshape(functions * size, -1)
             # pixels in air are left out
-            flat = flat[flat.any(axis=1)]
-            product = (flat.T @ flat).reshape(functions, z.shape[3], functions, z.shape[3])
-            i = self._first[block] * self._motions
-            size = min(z.shape[3], unknowns - i)
-            total[:, i : i + size, :, i : i + size] += product[:, :size, :, :size]
+            flat = flat[:, flat.any(axis=0)]
+            here = slice(z.first, z.first + size)
+            total[:, here, :, here] += (flat @ flat.T).reshape(functions, size, functions, size)
         return total.reshape(functions * unknowns, functions * unknowns)
 
 
-def overlaid(
-    fields: Sequence[tuple[Sensitivities, Image, tuple[int, int]]],
-    shape: tuple[int, ...],
-    pool: Executor | None = None,
-) -> Sensitivities:
-    """Return the sum, over a detector of `shape`, of fields times factors (row, column), from their first pixel on.
-
-    With a pool, halves of each field side by side.
-    """
-    motions = fields[0][0].motions
-    low, high = np.full(shape[0], np.iinfo(np.int64).max), np.zeros(shape[0], dtype=np.int64)
-    for field, _, (row, _) in fields:
-        rows = slice(row, row + len(field.values))
-        low[rows] = np.minimum(low[rows], field.first)
-        high[rows] = np.maximum(high[rows], field.first + field.values.shape[2] // motions)
-    low, values = _blank(low, high, shape, motions)
-    for field, factor, (row, column) in fields:
-        offset = (field.first - low[row : row + len(field.values)]) * motions
-
-        add = partial(_add_rows, values, field.values, offset, factor, (row, column))
-        for _ in (map if pool is None else pool.map)(add, _halves(len(field.values))):
-            pass
-    return Sensitivities(values=values, first=low, motions=motions)
-
-
-def _add_rows(
-    out: Image, values: Image, offset: NDArray[np.int64], factor: Image, corner: tuple[int, int], rows: slice
-) -> None:
-    """Add some rows of a field times a factor to `out`; see `_add_to`."""
-    _add_to(out, values[rows], offset[rows], factor[rows], corner[0] + rows.start, corner[1])
-
-
-def _blank(
-    low: NDArray[np.int64], high: NDArray[np.int64], shape: tuple[int, ...], motions: int
-) -> tuple[NDArray[np.int64], Image]:
-    """Return the first section of each row, and zeros for the sections from `low` to `high` (row,), 0 for none.
-
-    A row without any begins where its neighbours do: one from far below would make room for all in between.
-    """
-    filled = np.flatnonzero(high > 0)
-    if len(filled) == 0:
-        return np.zeros_like(low), np.zeros((*shape, motions), dtype=np.float32)
-    low = low[filled[np.abs(np.arange(len(low))[:, None] - filled).argmin(axis=1)]]
-    return low, np.zeros((*shape, max(int((high - low).max()), 1) * motions), dtype=np.float32)
-
-
-def spread(
-    field: Sensitivities, places: Floats, shape: tuple[int, ...], pool: Executor | None = None
-) -> Sensitivities:
-    """Return R^T of a field over the window: what each pixel of the detector takes part in.
-
-    With a pool, halves of the window side by side, to other last digits where they meet.
-    """
-    row = np.clip(np.floor(places[..., 0]).astype(np.int64), 0, shape[0] - 2)
-    top, bottom = np.maximum(row.min(axis=1) - 1, 0), np.minimum(row.max(axis=1) + 2, shape[0] - 1)
-    span = field.values.shape[2] // field.motions
-    low, high = np.full(shape[0], np.iinfo(np.int64).max), np.zeros(shape[0], dtype=np.int64)
-    for first, start, end in zip(field.first, top, bottom, strict=True):
-        low[start : end + 1] = np.minimum(low[start : end + 1], first)
-        high[start : end + 1] = np.maximum(high[start : end + 1], first + span)
-    low, values = _blank(low, high, shape, field.motions)
-    offset = (field.first[:, None] - low) * field.motions
-    if pool is None:
-        _scatter(field.values, offset, places, values)
-    else:
-        upper, lower = _halves(len(field.values))
-        # neighbours add to the same pixels
-        apart = np.zeros_like(values)
-        for _ in pool.map(
-            lambda part: _scatter(field.values[part[0]], offset[part[0]], places[part[0]], part[1]),
-            ((upper, values), (lower, apart)),
-        ):
-            pass
-        first = int(top[lower].min(initial=len(values)))
-        values[first:] += apart[first:]
-    return Sensitivities(values=values, first=low, motions=field.motions)
-
-
-def _halves(rows: int) -> tuple[slice, slice]:
-    return slice(0, rows // 2), slice(rows // 2, rows)
-
-
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
-def _filled(values):  # type: ignore[no-untyped-def]
-    """Return the range of a pixel's values that are not zero: of the sections that its ray meets, few of its row's."""
-    low, high = 0, len(values)
-    while low < high and values[low] == 0:
-        low += 1
-    while high > low and values[high - 1] == 0:
-        high -= 1
-    return low, high
+@apart(boundscheck=False)
+def _find_filled(values, filled):  # type: ignore[no-untyped-def]
+    """Write the ranges of each row's entries and columns outside which all is zero (row, 4): no ray meets more."""
+    for row in range(values.shape[0]):
+        low, high = 0, values.shape[1]
+        while low < high and not values[row, low].any():
+            low += 1
+        while high > low and not values[row, high - 1].any():
+            high -= 1
+        if low == high:
+            continue
+        left, right = values.shape[2], 0
+        for k in range(low, high):
+            column = 0
+            while column < left and values[row, k, column] == 0:
+                column += 1
+            left, column = column, values.shape[2]
+            while column > right and values[row, k, column - 1] == 0:
+                column -= 1
+            right = column
+        filled[row] = low, high, left, right
 
 
 @apart(fastmath=True, boundscheck=False)
-def _add_product(one, first, other, second, variance, out):  # type: ignore[no-untyped-def]
+def _dot(one, other):  # type: ignore[no-untyped-def]
+    """Return the sum of products over the columns of a row."""
+    total = np.float32(0)
+    for column in range(one.shape[0]):
+        total += one[column] * other[column]
+    return total
+
+
+@apart(boundscheck=False)
+def _add_times(to, factor, values):  # type: ignore[no-untyped-def]
+    """Add to each column of a row its factor times its value."""
+    for column in range(to.shape[0]):
+        to[column] += factor[column] * values[column]
+
+
+@apart(boundscheck=False)
+def _add_product(one, first, other, second, variance, alike, out):  # type: ignore[no-untyped-def]
     """Add v one^T other of each pixel to `out`; `first` and `second` (row,) are where a row's values belong there.
 
-    A row may have room for sections beyond the last: these are left out.
+    A row may have room for sections beyond the last: these are left out. Where both are `alike`, the lower triangle is
+    enough.
     """
+    weighted = np.empty(variance.shape[1], np.float32)
     for row in range(one.shape[0]):
-        # the pixels of a row share their sections: they are added up in a small matrix of their own, in double
-        # precision, which is added to its place in the large one when the row is done
-        i0, j0 = first[row], second[row]
-        height, width = min(one.shape[2], out.shape[0] - i0), min(other.shape[2], out.shape[1] - j0)
-        part = np.zeros((height, width))
-        for column in range(one.shape[1]):
-            for i in range(height):
-                w = variance[row, column] * one[row, column, i]
-                # most are zero: air, and sections of the row that this ray does not meet
-                if w != 0:
-                    for j in range(width):
-                        part[i, j] += w * other[row, column, j]
+        height, width = min(one.shape[1], out.shape[0] - first[row]), min(other.shape[1], out.shape[1] - second[row])
         for i in range(height):
-            for j in range(width):
-                out[i0 + i, j0 + j] += part[i, j]
+            filled = False
+            for column in range(len(weighted)):
+                weighted[column] = variance[row, column] * one[row, i, column]
+                filled |= weighted[column] != 0
+            if filled:
+                for j in range(i + 1 if alike else width):
+                    out[first[row] + i, second[row] + j] += _dot(weighted, other[row, j])
 
 
 @apart()
-def _scatter(values, offset, places, out):  # type: ignore[no-untyped-def]
-    """Add each pixel's values to the 4 x 4 pixels that it was interpolated from; the adjoint of `systematic._cubic`.
+def _scatter(values, offset, filled, places, chosen, row0, rows, out):  # type: ignore[no-untyped-def]
+    """Add each pixel's values to those of the 4 x 4 pixels it was interpolated from that lie in a band of rows.
 
-    One thread: neighbours add to the same pixels, and always in this order.
+    The adjoint of `systematic._cubic`. `out` begins at `row0` of the detector's `rows`; `chosen` (row,) of the window
+    reach it. Along a row neighbours were mostly interpolated from neighbours, and are added side by side as far as
+    they were.
     """
-    rows, columns = out.shape[0], out.shape[1]
+    columns, count = out.shape[2], values.shape[2]
+    i, j = np.empty(count, np.int64), np.empty(count, np.int64)
+    down, right = np.empty((4, count), np.float32), np.empty((4, count), np.float32)
+    share = np.empty(4 * count, np.float32)
+    into, what = out.reshape(-1), values.reshape(-1)
     for row in range(values.shape[0]):
-        for column in range(values.shape[1]):
-            low, high = _filled(values[row, column])
+        low, high, left, right_end = filled[row]
+        if low >= high or not chosen[row]:
+            continue
+        for column in range(left, right_end):
             r, c, longer = places[row, column]
-            i, j = first_pixel(r, rows), first_pixel(c, columns)
-            if low >= high or i < 0 or j < 0:
-                continue
-            down, right = keys_weights(r - i), keys_weights(c - j)
+            i[column], j[column] = first_pixel(r, rows), first_pixel(c, columns)
+            of_rows, of_columns = keys_weights(r - i[column]), keys_weights(c - j[column])
             for m in range(4):
-                to_row = min(max(i - 1 + m, 0), rows - 1)
-                # where the sections of this row of the window begin in that row of the detector
-                start = offset[row, to_row]
+                down[m, column], right[m, column] = longer * of_rows[m], of_columns[m]
+        start = left
+        while start < right_end:
+            at, to = i[start], j[start]
+            end = start + 1
+            # pixels of the edge stand for those beyond it, and are taken one by one
+            side_by_side = 1 <= to <= columns - 3
+            if side_by_side:
+                while end < right_end and i[end] == at and j[end] - to == end - start and j[end] <= columns - 3:
+                    end += 1
+            for m in range(4 if at >= 0 and to >= 0 else 0):
+                to_row = min(max(at - 1 + m, 0), rows - 1) - row0
+                if to_row < 0 or to_row >= out.shape[0]:
+                    continue
                 for n in range(4):
-                    share = np.float32(longer * down[m] * right[n])
-                    if share != 0:
-                        to = out[to_row, min(max(j - 1 + n, 0), columns - 1)]
-                        for k in range(low, high):
-                            to[start + k] += share * values[row, column, k]
+                    for x in range(start, end):
+                        share[n * count + x] = down[m, x] * right[n, x]
+                for k in range(low, high):
+                    line = (to_row * out.shape[1] + offset[row] + k) * columns
+                    source = (row * values.shape[1] + k) * count
+                    if side_by_side:
+                        _add_taps(into, line + to - 1, share, count, start, what, source + start, end - start)
+                        continue
+                    for n in range(4):
+                        column = min(max(to - 1 + n, 0), columns - 1)
+                        into[line + column] += share[n * count + start] * what[source + start]
+            start = end
+
+
+@apart(boundscheck=False)
+def _add_taps(to, at, share, width, start, values, source, count):  # type: ignore[no-untyped-def]
+    """Add to pixels in a line from `at` on what the four taps of `count` neighbours make of their values.
+
+    The shares of tap n are `width` after those before it. Numbers without a sign, as numba asks whether others count
+    from the end.
+    """
+    # the first three and the last three pixels are not reached by all taps
+    for e in range(min(count, 3) + 3):
+        d = e if e < 3 else max(count, 3) + e - 3
+        for n in range(max(d - count + 1, 0), min(d, 3) + 1):
+            to[at + d] += share[n * width + start + d - n] * values[source + d - n]
+    pixel, one = np.uint64(at), np.uint64(1)
+    of, value, step = np.uint64(start), np.uint64(source), np.uint64(width)
+    for d in range(np.uint64(3), np.uint64(max(count, 3))):
+        x = of + d
+        v = value + d
+        to[pixel + d] += (
+            share[x] * values[v]
+            + share[x + step - one] * values[v - one]
+            + share[x + step + step - one - one] * values[v - one - one]
+            + share[x + step + step + step - one - one - one] * values[v - one - one - one]
+        )
 
 
 @apart()
-def _add_to(out, values, offset, factor, row0, column0):  # type: ignore[no-untyped-def]
-    """Add factor(p) values(p, k) to out, which starts row0 and column0 earlier, `offset` (row,) entries on."""
-    for row in range(values.shape[0]):
-        for column in range(values.shape[1]):
-            scale = factor[row, column]
-            low, high = _filled(values[row, column])
-            to = out[row0 + row, column0 + column]
-            for k in range(low, high):
-                to[offset[row] + k] += scale * values[row, column, k]
+def _subtract(values, offset, filled, factor, chosen, down, right, out):  # type: ignore[no-untyped-def]
+    """Subtract factor(p) values(p, k) of some rows from `out`, so many rows down and columns right."""
+    share = np.empty(values.shape[2], np.float32)
+    for row in chosen:
+        for column in range(len(share)):
+            share[column] = -factor[row, column]
+        for k in range(filled[row, 0], filled[row, 1]):
+            into = out[row + down, offset[row] + k, right : right + len(share)]
+            _add_times(into, share, values[row, k])
 
 
-@apart(fastmath=True, boundscheck=False)
+@apart(boundscheck=False)
 def _pile_up(z, values, offset, sigma):  # type: ignore[no-untyped-def]
-    """Add sigma_f values(p, k) to z (row, column, f, k)."""
+    """Add sigma_f values(p, k) to z (row, f, k, column)."""
+    factor = np.empty(values.shape[2], np.float32)
     for row in range(values.shape[0]):
-        # unsigned: numba need not ask whether an index counts from the end
-        start = np.uint32(offset[row])
-        for column in range(values.shape[1]):
-            low, high = _filled(values[row, column])
-            for f in range(len(sigma)):
-                out = z[row, column, f]
-                for k in range(low, high):
-                    out[start + np.uint32(k)] += sigma[f] * values[row, column, k]
+        for f in range(len(sigma)):
+            factor[:] = sigma[f]
+            for k in range(values.shape[1]):
+                _add_times(z[row, f, offset + k], factor, values[row, k])

@@ -95,8 +95,8 @@ class Smoother(Solver):
     """any history: each step from the radiographs of all, by a Gaussian process over the steps"""
     most_passes: Annotated[int, Field(ge=1)] = 4
     """largest number of steps, each a pass over all radiographs"""
-    least_change: Annotated[float, Field(gt=0)] = 0.2
-    """converged: amplitudes change by less than this share of their standard deviations, rms"""
+    least_change: Annotated[float, Field(gt=0)] = 0.1
+    """converged: amplitudes would change by less than this share of their standard deviations, rms"""
     trend: tuple[TimeFunction, ...] = (Angle(),)
     """time functions of the rigid motion of the whole sample, beside the process"""
     bend_voxel: Annotated[float, Field(ge=1e-5)] | Literal["fit"] = "fit"
@@ -131,21 +131,24 @@ class Smoother(Solver):
         deviations, rounds = spaces[0].first_guess(), ROUNDS
         if self.bend_voxel != "fit":
             deviations, rounds = spaces[0].fixed(self.bend_voxel), 0
-        for _ in range(self.most_passes):
+        for moves in range(self.most_passes + 1):
             with _one_thread():
                 fit = _fitted(spaces, equations, noise, amplitude, deviations, rounds)
-                deviation = fit.deviation
+                wanted, deviation = fit.amplitude, fit.deviation
             deviations, rounds = fit.deviations, 1 if rounds > 1 else 0
-            moved, trial = self._carefully(problem, equations, amplitude, fit.amplitude)
-            last, share = _rms(moved - amplitude), _rms((moved - amplitude) / deviation)
-            amplitude, equations = moved, trial
-            rms.append(equations.rms)
+            left = wanted - amplitude
+            share = _rms(left / deviation)
+            # what the equations still ask for is known before another pass
             if share < self.least_change:
-                changed = f"the last change was {last:.2g} voxel rms, {share:.2g} of the standard deviations"
-                stop, reason = Stop.CONVERGED, f"converged: {changed}"
+                found = f"what is left is {_rms(left):.2g} voxel rms, {share:.2g} of the standard deviations"
+                stop, reason = Stop.CONVERGED, f"converged: {found}"
                 break
+            if moves == self.most_passes:
+                break
+            moved, equations = self._carefully(problem, equations, amplitude, wanted)
+            last, amplitude = _rms(moved - amplitude), moved
+            rms.append(equations.rms)
         with _one_thread():
-            fit = _fitted(spaces, equations, noise, amplitude, deviations, 0)
             known = _known(fit, noise, slow, equations.matrix)
             if equations.blocks and steps > COHERENT_DEGREE + 2:
                 finer = slow_functions(problem, COHERENT_DEGREE)

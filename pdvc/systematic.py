@@ -22,12 +22,15 @@ e has edges of a pixel or two, ten times above its noise, so that it is interpol
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import numba
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from pdvc.apart import apart
 from pdvc.geometry import gaps_rad, within_half_turn
 from pdvc.sections import SectionBasis
 
@@ -36,6 +39,8 @@ Image = NDArray[np.float32]
 
 REACH = 3.0
 """Standard deviations from which on a view takes no part in a mean over views."""
+KNOT = 16
+"""Pixels of a row from one place that is worked out to the next: in between a moved row bends by 1e-3 pixel."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,11 +140,16 @@ class Systematic:
         corner = np.array(self.corner, dtype=np.int64)
         sight = self.looked_along(steps, rays, basis, amplitude, voxel_mm)
         self.ready(np.unique(sight.views[sight.share > 0]).tolist())
-        for t, one in enumerate(result):
+
+        def register(t: int) -> None:
             field = np.zeros(self.detector, dtype=np.float32)
             for view, share in sight.of_step(t).items():
                 field += np.float32(share) * self.left(view)
-            _register(field, rays[t], float(sight.delta_rad[t]), basis.height_mm, maps[t], corner, one)
+            _register(field, rays[t], float(sight.delta_rad[t]), basis.height_mm, maps[t], corner, result[t])
+
+        with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+            for _ in pool.map(register, range(len(rays))):
+                pass
         return result
 
     def places(self, step: int, rays: Floats, basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Floats:
@@ -287,25 +297,68 @@ def _panel(rays):  # type: ignore[no-untyped-def]
     return (nx, ny, nz), depth, 1 / (dx * dx + dy * dy + dz * dz)
 
 
-@njit(nogil=True, cache=True, parallel=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
+def _along_row(rays, turn, panel, heights, maps, corner, row, place):  # type: ignore[no-untyped-def]
+    """Write the places of the pixels of a row, `place` (row, column and factor; column).
+
+    Worked out at every `KNOT`-th pixel, and linear in between.
+    """
+    normal, depth, per_pitch2 = panel
+    last = place.shape[1] - 1
+    r, c, longer, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, 0, 0)
+    place[0, 0], place[1, 0], place[2, 0] = r, c, longer
+    for start in range(0, last, KNOT):
+        end = min(start + KNOT, last)
+        r1, c1, longer1, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, end, k)
+        per_pixel = 1 / (end - start)
+        for n in range(1, end - start + 1):
+            share = n * per_pixel
+            place[0, start + n] = r + share * (r1 - r)
+            place[1, start + n] = c + share * (c1 - c)
+            place[2, start + n] = longer + share * (longer1 - longer)
+        r, c, longer = r1, c1, longer1
+
+
+@apart(boundscheck=False)
+def _cubic_inside(field, columns, place, out):  # type: ignore[no-untyped-def]
+    """Write the factor times the field, flat, at the places of a row, all of them a pixel and more from its edges."""
+    width = np.uint32(columns)
+    for column in range(out.shape[0]):
+        i, j = np.uint32(place[0, column]), np.uint32(place[1, column])
+        down = keys_weights(np.float32(place[0, column] - i))
+        right = keys_weights(np.float32(place[1, column] - j))
+        at = (i - np.uint32(1)) * width + j - np.uint32(1)
+        total = np.float32(0)
+        for m in range(4):
+            line = np.float32(0)
+            for n in range(4):
+                line += right[n] * field[at + np.uint32(n)]
+            total += down[m] * line
+            at += width
+        out[column] = np.float32(place[2, column]) * total
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def _register(field, rays, delta, heights, maps, corner, out):  # type: ignore[no-untyped-def]
     """Sample a step's field where each pixel's material was before it moved."""
-    normal, depth, per_pitch2 = _panel(rays)
-    turn = np.cos(delta), np.sin(delta)
-    for row in prange(out.shape[0]):
-        k = 0
-        for column in range(out.shape[1]):
-            r, c, longer, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, column, k)
-            out[row, column] = longer * _cubic(field, r, c)
+    panel, turn = _panel(rays), (np.cos(delta), np.sin(delta))
+    flat, (rows, columns) = field.reshape(-1), field.shape
+    place = np.empty((3, out.shape[1]))
+    for row in range(out.shape[0]):
+        _along_row(rays, turn, panel, heights, maps, corner, row, place)
+        r, c = place[0], place[1]
+        if r.min() >= 1 and r.max() < rows - 2 and c.min() >= 1 and c.max() < columns - 2:
+            _cubic_inside(flat, columns, place, out[row])
+        else:
+            for column in range(out.shape[1]):
+                out[row, column] = place[2, column] * _cubic(field, r[column], c[column])
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _find_places(rays, delta, heights, maps, corner, out):  # type: ignore[no-untyped-def]
     """Write the places of all pixels of one step."""
-    normal, depth, per_pitch2 = _panel(rays)
-    turn = np.cos(delta), np.sin(delta)
-    k = 0
+    panel, turn = _panel(rays), (np.cos(delta), np.sin(delta))
+    place = np.empty((3, out.shape[1]))
     for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            r, c, longer, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, column, k)
-            out[row, column] = r, c, longer
+        _along_row(rays, turn, panel, heights, maps, corner, row, place)
+        out[row] = place.T

@@ -289,8 +289,8 @@ class Tracker:
         sight = systematic.looked_along(slice(None), rays, self._basis, amplitude, images.voxel_mm)
         weighted = weighted_sensitivities(images, self._basis, amplitude, [0])[0]
         places = systematic.places(0, rays[0], self._basis, amplitude[0], images.voxel_mm)
-        meets = StepNoise.of(noise, 0, sight.of_step(0), weighted, places, systematic.corner, self._pool)
-        covariance = meets.own(noise.flat, unknowns, ("views", "flats"), self._pool)
+        meets = StepNoise.of(noise, 0, sight.of_step(0), weighted, places, systematic.corner)
+        covariance = meets.of_scan(noise.flat, unknowns, self._pool)
         left = registered_left(images, self._basis, amplitude, 0)
         return _Awaited(
             step=radiograph.step,

@@ -106,7 +106,7 @@ class Sums(NamedTuple):
     residual: Image
     """rho (step, row, column)."""
     kept: Image
-    """S (step, row, column, unknown) where it is asked for, else empty."""
+    """S (step, row, unknown, column) where it is asked for, else empty."""
 
 
 @njit(nogil=True, cache=True, error_model="numpy", parallel=True)
@@ -215,9 +215,9 @@ def _walk_band(scene, steps, sums, with_sensitivities, t, band):  # type: ignore
                 first, last = (first_section - low) * motions, (last_section + 1 - low) * motions
                 _add_products(s, first, last, used, weighted, of_i, matrix, vectors[block])
                 if kept.size > 0:
-                    for ray in range(count):
-                        for i in range(first, last):
-                            kept[row, column0 + ray, i] = s[i * LANES + ray]
+                    for i in range(first, last):
+                        for ray in range(count):
+                            kept[row, i, column0 + ray] = s[i * LANES + ray]
                 s[first * LANES : last * LANES] = 0.0
 
 

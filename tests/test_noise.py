@@ -13,11 +13,11 @@ from pdvc.equations import linearise
 from pdvc.measurement import ResidualTests
 from pdvc.noise import ImageNoise, Noise, Propagated, known_from_residual, propagate, separate
 from pdvc.prior import Prior
-from pdvc.projection import Sensitivities, sensitivities
+from pdvc.projection import sensitivities
 from pdvc.radiographs import smoothed
 from pdvc.rays import ray_vectors
 from pdvc.residual_tests import residual_tests
-from pdvc.sensitivity_sums import Pile
+from pdvc.sensitivity_sums import Pile, Rows
 from pdvc.systematic import Systematic
 from pdvc.uncertainty import posterior
 from tests.small_case import ANGLES, SCANNER, SECTIONS, SHAPE, STEPS, VOXEL_MM, motion, radiographs, time_functions
@@ -91,11 +91,12 @@ def vectors(sources: Noise, places: Systematic, draws: int) -> np.ndarray:
     """Return c (draw, step, unknown) of draws of noise, by the sensitivities that the equations are made of."""
     images = radiographs(SECTIONS, AMPLITUDE)
     fields = sensitivities(images.volume, images.rays, SHAPE, SECTIONS, AMPLITUDE, voxel_mm=VOXEL_MM)
-    whole = np.zeros((STEPS, *SHAPE, UNKNOWNS + fields[0].values.shape[2]))
+    width = fields[0].values.shape[1]
+    whole = np.zeros((STEPS, *SHAPE, UNKNOWNS + width))
     for t, field in enumerate(fields):
         for row, first in enumerate(field.first):
             at = first * SECTIONS.shape[1]
-            whole[t, row, :, at : at + field.values.shape[2]] = field.values[row]
+            whole[t, row, :, at : at + width] = field.values[row].T
     dense = whole[..., :UNKNOWNS].reshape(STEPS, -1, UNKNOWNS)
     residuals = np.stack([drawn(k, sources, places) for k in range(draws)]).reshape(draws, STEPS, -1)
     return np.einsum("tpn,dtp->dtn", dense, residuals, optimize=True)
@@ -287,10 +288,11 @@ def test_a_pile_has_the_same_bits_whichever_block_a_pool_begins_with():
     found = []
     for pool in (None, LastFirst()):
         rng = np.random.default_rng(3)
-        pile = Pile(shape, functions, 2)
+        pile = Pile(functions)
         for step in range(3):
             # from row to row far larger, so that sums in double precision are rounded
-            values = (rng.normal(size=(*shape, 6)) * np.geomspace(1, 1e9, 64)[:, None, None]).astype(np.float32)
-            pile.add(step, Sensitivities(values=values, first=np.zeros(64, dtype=np.int64), motions=2), pool)
+            values = (rng.normal(size=(64, 6, 7)) * np.geomspace(1, 1e9, 64)[:, None, None]).astype(np.float32)
+            parts = [Rows(values=part, first=0) for part in values.reshape(4, 16, 6, 7)]
+            pile.add(step, range(4), parts.__getitem__, pool)
         found.append(pile.covariance(np.full(shape, 0.1, dtype=np.float32), 6))
     np.testing.assert_array_equal(found[0], found[1])

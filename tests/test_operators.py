@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,8 @@ from pdvc.radiographs import binned, coarsened, smoothed
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import _filtered, _ramp
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis, names_of
-from pdvc.sensitivity_sums import overlaid, spread
-from pdvc.systematic import Systematic
+from pdvc.sensitivity_sums import BAND_ROWS, Rows, Spread, summed
+from pdvc.systematic import Systematic, taps
 from tests.laws import law
 from tests.operators import dottest
 from tests.small_case import (
@@ -56,12 +55,28 @@ TURNED_AS_ONE = np.tile([1.0, -0.4, 0.6, 0.5, -0.3, 3.0, 0.0], (len(CLOSE.height
 
 def dense(field: Sensitivities, unknowns: int) -> np.ndarray:
     """Return S (row, column, unknown) in full."""
-    rows, columns, width = field.values.shape
+    rows, width, columns = field.values.shape
     whole = np.zeros((rows, columns, unknowns + width))
     for row, first in enumerate(field.first):
         at = first * field.motions
-        whole[row, :, at : at + width] = field.values[row]
+        whole[row, :, at : at + width] = field.values[row].T
     return whole[..., :unknowns]
+
+
+def joined(parts: list[Rows], unknowns: int) -> np.ndarray:
+    """Return a field that is given band by band, (row, column, unknown) in full."""
+    found = []
+    for part in parts:
+        rows, width, columns = part.values.shape
+        whole = np.zeros((rows, columns, unknowns + width))
+        whole[..., part.first : part.first + width] = part.values.transpose(0, 2, 1)
+        found.append(whole[..., :unknowns])
+    return np.concatenate(found)
+
+
+def moved(spread: Spread, unknowns: int) -> np.ndarray:
+    """Return Y (row, column, unknown) in full: one band is looked at before the next one takes its room."""
+    return np.concatenate([joined([spread.moved(band)], unknowns) for band in spread.bands])
 
 
 # The projection and its sensitivities
@@ -215,10 +230,10 @@ def test_spreading_is_the_adjoint_of_registration(scanner, angle, seed, size, be
         places = still.places(0, rays[0], CLOSE, amplitude[0], VOXEL_MM)
         share = still.looked_along(slice(0, 1), rays, CLOSE, amplitude, VOXEL_MM).of_step(0)
         field = Sensitivities(
-            values=image[..., None].astype(np.float32), first=np.zeros(window[0], dtype=np.int64), motions=1
+            values=image[:, None].astype(np.float32), first=np.zeros(window[0], dtype=np.int64), motions=1
         )
-        moved = dense(spread(field, places, whole), 1)[..., 0]
-        return np.stack([share.get(view, 0.0) * moved for view in (0, 1)])
+        found = moved(Spread(weighted=field, places=places, corner=(0, 0), shape=whole), 1)[..., 0]
+        return np.stack([share.get(view, 0.0) * found for view in (0, 1)])
 
     dottest(forward, adjoint, (2, *whole), window, seed=seed)
 
@@ -226,46 +241,79 @@ def test_spreading_is_the_adjoint_of_registration(scanner, angle, seed, size, be
 @law(25)
 @given(st.integers(0, 10**6), st.floats(0.0, 3.0))
 def test_fields_whose_rows_meet_different_sections_are_spread_section_by_section(seed, size):
-    """Each section's part of a field goes where a field of that section alone goes."""
-    rng, window, whole = np.random.default_rng(seed), (9, 7), (14, 12)
+    """Each section's part of a field goes where a field of that section alone goes, by the taps told one by one."""
+    rng, window, whole = np.random.default_rng(seed), (40, 7), (50, 12)
     places = np.ones((*window, 3))
-    places[..., :2] = np.stack(np.indices(window) + 2.0, axis=-1) + size * rng.normal(size=(*window, 2))
+    # mostly neighbours from neighbours, in part from anywhere, off the detector too
+    places[..., :2] = np.stack(np.indices(window) + rng.uniform(-2, 6, 2)[:, None, None], axis=-1)
+    places[..., :2] += size * rng.normal(size=(*window, 2)) * (rng.random(window) < 0.3)[..., None]
+    places[..., 2] = rng.uniform(0.9, 1.1, window)
     field = Sensitivities(
-        values=rng.normal(size=(*window, 4)).astype(np.float32), first=rng.integers(0, 4, window[0]), motions=2
+        values=(rng.normal(size=(window[0], 4, window[1])) * (rng.random((window[0], 1, window[1])) < 0.9)).astype(
+            "f4"
+        ),
+        first=rng.integers(0, 4, window[0]),
+        motions=2,
     )
-    together = spread(field, places, whole)
-    assert (together.first >= 0).all()
-    parts = dense(field, 10)
-    for k in range(10):
-        one = replace(field, values=parts[..., k : k + 1].astype(np.float32), first=0 * field.first, motions=1)
-        expected = dense(spread(one, places, whole), 1)[..., 0]
-        np.testing.assert_allclose(dense(together, 10)[..., k], expected, atol=1e-5)
-    with ThreadPoolExecutor(2) as pool:
-        halves = spread(field, places, whole, pool)
-    np.testing.assert_allclose(halves.values, together.values, atol=1e-5)
+    parts, expected = dense(field, 10), np.zeros((*whole, 10))
+    for row, column in np.ndindex(window):
+        (r, c), longer = places[row, column, :2], places[row, column, 2]
+        if not (-0.01 <= r <= whole[0] - 0.99 and -0.01 <= c <= whole[1] - 0.99):
+            continue
+        i, j = np.clip([int(r), int(c)], 0, [whole[0] - 2, whole[1] - 2])
+        down, right = taps(np.array([r, c]), np.array([i, j])).T
+        for m, n in np.ndindex(4, 4):
+            to = np.clip(i - 1 + m, 0, whole[0] - 1), np.clip(j - 1 + n, 0, whole[1] - 1)
+            expected[to] += longer * down[m] * right[n] * parts[row, column]
+    together = Spread(weighted=field, places=places, corner=(5, 3), shape=whole)
+    np.testing.assert_allclose(moved(together, 10), expected, atol=1e-5)
+    view, image = rng.random(whole).astype("f4"), rng.random(window).astype("f4")
+    expected *= view[..., None]
+    expected[5:45, 3:10] -= image[..., None] * parts
+    found = [joined([together.shared(b, together.moved(b), view, image)], 10) for b in together.bands]
+    np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-5)
 
 
 @law(25)
 @given(st.integers(1, 12), st.integers(-6, 6), st.integers(0, 10**6))
-def test_fields_laid_over_each_other_take_room_for_the_sections_that_rows_meet_and_no_more(rise, moved, seed):
-    """A field spread some rows away leaves rows to the other one alone, far up the sample."""
-    rng, window, whole, corner = np.random.default_rng(seed), (24, 3), (60, 6), (18, 1)
-    field = Sensitivities(
-        values=rng.normal(size=(*window, 6)).astype(np.float32), first=100 + np.arange(24) // rise, motions=2
-    )
+def test_a_band_takes_room_for_the_sections_that_its_rows_meet_and_no_more(rise, away, seed):
+    """A field far up the sample, moved by some rows: bands beside it are empty, others hold a few sections."""
+    rng, window, whole, corner = np.random.default_rng(seed), (24, 3), (90, 6), (18, 1)
+    values = rng.normal(size=(window[0], 6, window[1])).astype(np.float32)
+    field = Sensitivities(values=values, first=100 + np.arange(24) // rise, motions=2)
     places = np.ones((*window, 3))
-    places[..., :2] = np.stack(np.indices(window), axis=-1) + np.array(corner) + [moved + 0.3, 0.5]
-    elsewhere = spread(field, places, whole)
+    places[..., :2] = np.stack(np.indices(window), axis=-1) + np.array(corner) + [away + 0.3, 0.5]
+    spread = Spread(weighted=field, places=places, corner=corner, shape=whole)
     even = np.ones(whole, dtype=np.float32)
-    fields = [(elsewhere, even, (0, 0)), (field, even[:24, :3], corner)]
-    together = overlaid(fields, whole)
+    for band in spread.bands:
+        part = spread.shared(band, spread.moved(band), even, even[:24, :3])
+        # three sections a row, those of sixteen rows and of as many as the field was moved and is spread over
+        assert part.values.shape[1] // 2 <= 3 + (BAND_ROWS + 4 + abs(away)) // rise + 1
+    assert spread.moved(len(spread.bands) - 1).values.size == 0
+
+
+@law(25)
+@given(st.integers(0, 10**6), st.booleans())
+def test_products_are_those_of_the_whole_detector(seed, in_halves):
+    rng, window, whole = np.random.default_rng(seed), (30, 6), (40, 9)
+    values = rng.normal(size=(window[0], 6, window[1])).astype(np.float32)
+    field = Sensitivities(values=values, first=np.arange(30) // 8, motions=2)
+    places = np.ones((*window, 3))
+    places[..., :2] = np.stack(np.indices(window), axis=-1) + rng.uniform(0, 4, 2)
+    spread = Spread(weighted=field, places=places, corner=(4, 2), shape=whole)
+    variance, full = rng.random(whole).astype("f4"), moved(spread, 12)
+
+    def add(band, found):
+        part = spread.moved(band)
+        part.add_product(part, variance[spread.rows(band)], found[0])
+
     with ThreadPoolExecutor(2) as pool:
-        np.testing.assert_array_equal(overlaid(fields, whole, pool).values, together.values)
-    # three sections a row, those of rows taken from, and of rows as far as the field was moved
-    assert together.values.shape[2] // 2 <= 3 + 2 + (4 + abs(moved)) // rise
-    expected = dense(elsewhere, 300)
-    expected[18:42, 1:4] += dense(field, 300)
-    np.testing.assert_allclose(dense(together, 300), expected, atol=1e-6)
+        (found,) = summed(spread.bands, 12, add, pool=pool if in_halves else None)
+    np.testing.assert_allclose(found, np.einsum("rcn,rc,rcm->nm", full, variance, full), rtol=1e-4, atol=1e-3)
+    joint = np.zeros((12, 12))
+    for band in spread.bands:
+        spread.moved(band).add_product(spread.moved(band, "other"), variance[spread.rows(band)], joint)
+    np.testing.assert_allclose(joint, found, rtol=1e-4, atol=1e-3)
 
 
 # Filters
