@@ -23,7 +23,8 @@ import numba
 import numpy as np
 
 from benchmarks.timing import machine
-from pdvc.alarms import CRACK, Watch
+from pdvc.alarms import Watch
+from pdvc.cells import CRACK
 from pdvc.compilation import compile_kernels
 from pdvc.experiment import Experiment, read_experiment
 from pdvc.incoming import Arrival

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc.cells import Cells, Spot
+from pdvc.cells import CRACK, LEAST_STEPS, Cells, Spot
 from pdvc.data_checks import AIR_DOUBT, EDGE_SEEN, SATURATED, clips
 from pdvc.deviations import beam_frame
 from pdvc.examination import StackLook, look_at, share_at_top
@@ -52,12 +52,10 @@ AIR_LOST = 0.05
 """Departure of the air's transmission from 1 above which the motion is not to be told from a radiograph."""
 STAGE = 0.05
 """By how much more a radiograph is like what is seen from where the stage was, than from where it should be."""
-SUDDEN, LOCAL, CRACK = 6.0, 8.0, 8.0
+SUDDEN, LOCAL = 6.0, 8.0
 """Limits of what is over its deviation."""
 USUAL = 20
 """Steps that tell what is usual."""
-LEAST_USUAL = 8
-"""The same, at least: before that nothing is unusual."""
 SPAN, BEFORE = 8, 2
 """Steps over which strain grows, and how many times as many before it is compared with."""
 LOCAL_SHARE = 0.5
@@ -123,7 +121,7 @@ class Watch:
             return ()
         self._newest = line.step
         spot = self._cells.add(taken.residual, taken.amplitude, np.deg2rad(line.angle_deg))
-        self.spot = spot if self._cells.steps > LEAST_USUAL else None
+        self.spot = spot if self._cells.steps > LEAST_STEPS else None
         return (*self._of_place(taken), *self._of_motion(line, taken), *self._of_strain(line), *self._of_spot())
 
     def new(self, step: int, alarms: tuple[Alarm, ...]) -> tuple[Alarm, ...]:
@@ -241,7 +239,7 @@ class Watch:
         shown = np.array(list(seen.values())) @ np.tile(np.eye(motions), sections) / sections
         jump = shown @ (taken.amplitude - taken.expected).ravel()
         past, self._jumps = self._jumps, [*self._jumps[-USUAL + 1 :], jump]
-        if len(past) < LEAST_USUAL:
+        if len(past) < LEAST_STEPS:
             return
         usual = usual_size(np.array(past), axis=0)
         score = np.abs(jump) / np.sqrt(usual**2 + np.einsum("mu,uv,mv->m", shown, taken.uncertain, shown))

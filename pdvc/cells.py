@@ -40,6 +40,10 @@ MOST_CELLS = 30_000
 """Cells of a sample, about, at most."""
 SOON, PLACED, LATE = 1 / 3, 1 / 12, 1 / 30
 """Share of a step in the mean over few steps, over as many as tell a place, and over many."""
+CRACK = 8.0
+"""Deviations from which on a spot is taken for something that opened, and not for noise."""
+LEAST_STEPS = 8
+"""Steps that tell what is usual, at least."""
 USED_SHARE = 0.3
 """Share of a square of pixels that is used, at least, to count."""
 MOST, TRUST = 5.0, 2.0

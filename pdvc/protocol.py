@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.cells import Cells, Spot
 from pdvc.compilation import compile_kernels
 from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
 from pdvc.deviations import step_covariance, turned_std
@@ -30,7 +31,7 @@ from pdvc.pattern import fixed_pattern
 from pdvc.preparation import Prepared, noise_of, prepare, snr_of, snr_reprojection
 from pdvc.progress import Progress, silent
 from pdvc.residual_tests import residual_tests
-from pdvc.result_checks import check_finite, doubts_of_result
+from pdvc.result_checks import check_finite, doubts_of_result, doubts_of_spots
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, set_up
 from pdvc.solution import Known, Problem, Solution
@@ -60,9 +61,9 @@ def measure(
     doubts = (*doubts_of_data(examined, experiment), *doubts_of_time(time_parts, experiment.test))
     examining = time.perf_counter() - examining
     with explained_by(doubts):
-        found, volume = _measured(experiment, options, work, progress)
+        found, volume, spots = _measured(experiment, options, work, progress)
     after = doubts_of_result(found, volume, experiment.geometry, options.prior_voxel)
-    verdict = Verdict(doubts=(*doubts, *after))
+    verdict = Verdict(doubts=(*doubts, *after, *doubts_of_spots(spots)))
     with explained_by(verdict.doubts):
         check_finite(found)
     seconds = {"compile": compiling, "examine": examining, **found.provenance.seconds}
@@ -71,8 +72,8 @@ def measure(
 
 def _measured(
     experiment: Experiment, options: MeasureOptions, work: Path | None, progress: Progress
-) -> tuple[Measurement, Volume]:
-    """Return a measurement without a verdict, and the reference volume at scale 1."""
+) -> tuple[Measurement, Volume, list[Spot]]:
+    """Return a measurement without a verdict, the reference volume at scale 1, and what is new at each step."""
     started = time.perf_counter()
     setup = set_up(experiment, options, work=work, progress=progress)
     rigid, sections, time_functions = setup.rigid, setup.sections, setup.time_functions()
@@ -104,7 +105,13 @@ def _measured(
     else:
         known = stated(found.known, equations, functions, prior)
     unknowns = len(functions) * standing[0].size
-    tests = residual_tests(fine.images, fine.systematic, sections, amplitude, noise, equations.residual, unknowns)
+    cells, spots = Cells(setup.geometry.cropped(*setup.window), sections, setup.outline.hull), list[Spot]()
+
+    def see(step: int, white: Image) -> None:
+        spots.append(cells.add(white, amplitude[step], float(experiment.test.angle_rad[step])))
+
+    residual = equations.residual
+    tests = residual_tests(fine.images, fine.systematic, sections, amplitude, noise, residual, unknowns, see)
     snr_views = snr_reprojection(fine, sections, amplitude)
     amplitude[:, ~known.observed] = np.nan
     snr = snr_of(fine.images)
@@ -133,7 +140,7 @@ def _measured(
             snr_noise_db=fine.snr_noise_db,
             residual_initial=initial,
             residual_rigid=after_rigid,
-            residual_final=equations.residual,
+            residual_final=residual,
             residual_tests=tests,
         ),
         provenance=Provenance(
@@ -146,7 +153,7 @@ def _measured(
             versions=versions(),
         ),
     )
-    return measurement, fine.images.volume
+    return measurement, fine.images.volume, spots
 
 
 def _on_the_axis(

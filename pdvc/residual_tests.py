@@ -35,22 +35,23 @@ def residual_tests(
     """Return whether the residual (step, row, column), grey levels, of a solution is the noise that is expected.
 
     At amplitudes (step, section, motion), voxels; `unknowns` of all steps were found. `see` is shown the residual of
-    each step over its standard deviation, zero where it is not used.
+    each step over its standard deviation, zero where it is not used, one step after the other.
     """
     overlap = noise_overlap(noise.smooth_px)
     sight = systematic.looked_along(slice(None), images.rays, basis, amplitude, images.voxel_mm)
 
-    def of_step(t: int) -> _Sums:
+    def of_step(t: int) -> tuple[Image, _Sums]:
         places = systematic.places(t, images.rays[t], basis, amplitude[t], images.voxel_mm)
         used, view = images.weight[t % len(images.weight)] > 0, mean_of_views(noise, sight.of_step(t))
-        white, sums = _sums(overlap, residual[t], used, noise.step(t), view, noise.flat, places, systematic.corner)
-        see(t, white)
-        return sums
+        return _sums(overlap, residual[t], used, noise.step(t), view, noise.flat, places, systematic.corner)
 
+    found = []
     # a step is one thread's work; sums are added in order, whichever is ready first
     with ThreadPoolExecutor(numba.get_num_threads()) as pool:
-        total = reduce(_Sums.__add__, pool.map(of_step, range(len(residual))))
-    return total.result(unknowns)
+        for t, (white, sums) in enumerate(pool.map(of_step, range(len(residual)))):
+            see(t, white)
+            found.append(sums)
+    return reduce(_Sums.__add__, found).result(unknowns)
 
 
 @dataclass(frozen=True, kw_only=True)

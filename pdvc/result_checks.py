@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.cells import CRACK, LEAST_STEPS, Spot
 from pdvc.experiment import DESCRIPTION
 from pdvc.geometry import ConeBeam
 from pdvc.measurement import Measurement
@@ -51,6 +52,24 @@ def doubts_of_result(found: Measurement, volume: Volume, geometry: ConeBeam, pri
         *_of_convergence(found),
         *_of_basis(found),
         *_of_force(found, volume.hull),
+    )
+
+
+def doubts_of_spots(spots: Sequence[Spot]) -> tuple[Doubt, ...]:
+    """Return what speaks against a measurement by where on the sample its residual showed something new, by step."""
+    over = [t for t, spot in enumerate(spots) if t >= LEAST_STEPS and spot.score > CRACK]
+    if not over:
+        return ()
+    most = max((spots[t] for t in over), key=lambda spot: spot.score)
+    x, y, z = most.place_mm
+    return (
+        Doubt(
+            name="crack",
+            figure=f"from step {over[0]} on the residual shows less material than before at x = {x:.2f}, y = {y:.2f}, "
+            f"z = {z:.2f} mm, by {most.score:.0f} deviations",
+            advice="something opened there, which no motion of sections follows: look at the residual",
+            steps=tuple(over),
+        ),
     )
 
 

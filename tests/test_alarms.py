@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from pdvc.alarms import BEFORE, LEAST_USUAL, QUIET, SPAN, Alarm, Watch
-from pdvc.cells import Cells
+from pdvc.alarms import BEFORE, QUIET, SPAN, Alarm, Watch
+from pdvc.cells import LEAST_STEPS, Cells
 from pdvc.experiment import Experiment, read_experiment
 from pdvc.geometry import ConeBeam
 from pdvc.incoming import Arrival
@@ -77,7 +77,7 @@ def test_a_spot_that_comes_up_is_found_where_it_is_on_the_sample(radius, directi
     before = 0.0
     for t, image in residuals(54, seed, place, since=30, height=5.0, shift_mm=shift):
         spot = cells.add(image, amplitude, t * STEP_RAD)
-        before = max(before, spot.score) if LEAST_USUAL < t < 30 else before
+        before = max(before, spot.score) if LEAST_STEPS < t < 30 else before
     assert before < 8 < spot.score
     # to a cell's side
     np.testing.assert_allclose(spot.place_mm, place, atol=0.2)
@@ -90,7 +90,7 @@ def test_what_was_always_there_is_not_new_and_more_material_is_no_crack():
             cells.add(image, still(), t * STEP_RAD).score
             for t, image in residuals(60, 1, (0.3, 0.2, 0.5), since=since, height=height)
         ]
-        assert max(scores[LEAST_USUAL:]) < 8
+        assert max(scores[LEAST_STEPS:]) < 8
 
 
 def test_what_a_single_radiograph_shows_is_no_crack():
@@ -100,7 +100,7 @@ def test_what_a_single_radiograph_shows_is_no_crack():
         if t in (20, 32):
             images[t] = image
     scores = [cells.add(image, still(), t * STEP_RAD).score for t, image in images.items()]
-    assert max(scores[LEAST_USUAL:]) < 8
+    assert max(scores[LEAST_STEPS:]) < 8
 
 
 def test_a_pixel_that_is_not_finite_and_a_sample_thinner_than_a_cell_do_no_harm():
@@ -225,7 +225,7 @@ def test_a_jump_that_a_radiograph_shows_is_sudden_and_one_along_the_beam_is_not(
 
 def test_nothing_is_unusual_before_it_is_known_what_is_usual(setup):
     watch = Watch(setup)
-    for step in range(LEAST_USUAL):
+    for step in range(LEAST_STEPS):
         assert watch.followed(*motion(setup, step, jump=(0, 5.0 * (step % 2), 0, 0, 0, 0, 0))) == ()
 
 

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdvc.cells import Spot
 from pdvc.geometry import ConeBeam
 from pdvc.measurement import ResidualTests
 from pdvc.measurement_file import read_measurement, write_measurement
-from pdvc.result_checks import cut_rows, doubts_of_result, doubts_of_solution
+from pdvc.result_checks import cut_rows, doubts_of_result, doubts_of_solution, doubts_of_spots
 from pdvc.verdict import Doubt, Stop, Verdict, explained_by, listed
 from pdvc.volume import Grid, Volume, hull_of
 from tests.synthetic_records import HEIGHT_MM, VOXEL_MM, altered, measurement, stretched, tensile_history
@@ -119,6 +120,18 @@ def test_a_solution_that_hardly_moves_any_more_has_converged():
 def test_what_is_explained_by_nothing_is_fatal():
     assert doubts(result(snr_final_db=np.full(24, 3.0)))["not-explained"].fatal
     assert doubts(result(snr_reprojection_db=np.full(40, 3.0)))["reference-volume"].fatal
+
+
+def test_a_spot_that_comes_up_is_told_with_its_first_step_and_its_place():
+    nowhere, there = (Spot(score=score, place_mm=(0.1, -0.2, 0.8)) for score in (3.0, 12.0))
+    larger = Spot(score=30.0, place_mm=(0.3, 0.0, 0.7))
+    assert doubts_of_spots([nowhere] * 20) == ()
+    # the first steps tell what is usual
+    assert doubts_of_spots([there] * 4 + [nowhere] * 16) == ()
+    (doubt,) = doubts_of_spots([nowhere] * 10 + [there, nowhere, larger])
+    assert (doubt.name, doubt.steps, doubt.fatal) == ("crack", (10, 12), False)
+    assert "from step 10 on" in doubt.figure
+    assert "x = 0.30, y = 0.00, z = 0.70 mm, by 30 deviations" in doubt.figure
 
 
 def test_as_many_functions_as_steps_join_nothing():
