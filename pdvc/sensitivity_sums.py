@@ -230,6 +230,8 @@ class Pile:
         # from the top down, whichever a pool began with: the sum is to have the same bits
         for band, z in sorted(self._bands.items()):
             size = min(z.values.shape[2], unknowns - z.first)
+            if size <= 0:
+                continue
             root = np.sqrt(variance[band * BAND_ROWS : band * BAND_ROWS + len(z.values)])
             flat = (z.values[:, :, :size] * root[:, None, None]).transpose(1, 2, 0, 3).reshape(functions * size, -1)
             # pixels in air are left out

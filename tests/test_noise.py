@@ -293,6 +293,8 @@ def test_a_pile_has_the_same_bits_whichever_block_a_pool_begins_with():
             # from row to row far larger, so that sums in double precision are rounded
             values = (rng.normal(size=(64, 6, 7)) * np.geomspace(1, 1e9, 64)[:, None, None]).astype(np.float32)
             parts = [Rows(values=part, first=0) for part in values.reshape(4, 16, 6, 7)]
-            pile.add(step, range(4), parts.__getitem__, pool)
-        found.append(pile.covariance(np.full(shape, 0.1, dtype=np.float32), 6))
+            # and no ray meets the sample in the last band
+            nothing = Rows(values=np.zeros((16, 0, 7), dtype=np.float32), first=0)
+            pile.add(step, range(5), [*parts, nothing].__getitem__, pool)
+        found.append(pile.covariance(np.full((80, 7), 0.1, dtype=np.float32), 6))
     np.testing.assert_array_equal(found[0], found[1])
