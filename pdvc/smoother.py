@@ -127,7 +127,8 @@ class Smoother(Solver):
         equations = problem.linearise(amplitude.reshape(steps, *shape))
         slow = slow_functions(problem)
         noise = problem.noise_at(amplitude.reshape(steps, *shape), equations, slow)
-        rms, last, stop, reason = [equations.rms], 0.0, Stop.MOST, f"{self.most_passes} passes done, the most allowed"
+        rms, stop = [equations.rms], Stop.UNFINISHED
+        reason = f"{self.most_passes} passes done, the most allowed"
         deviations, rounds = spaces[0].first_guess(), ROUNDS
         if self.bend_voxel != "fit":
             deviations, rounds = spaces[0].fixed(self.bend_voxel), 0
@@ -136,17 +137,15 @@ class Smoother(Solver):
                 fit = _fitted(spaces, equations, noise, amplitude, deviations, rounds)
                 wanted, deviation = fit.amplitude, fit.deviation
             deviations, rounds = fit.deviations, 1 if rounds > 1 else 0
-            left = wanted - amplitude
-            share = _rms(left / deviation)
+            left, share = _rms(wanted - amplitude), _rms((wanted - amplitude) / deviation)
             # what the equations still ask for is known before another pass
             if share < self.least_change:
-                found = f"what is left is {_rms(left):.2g} voxel rms, {share:.2g} of the standard deviations"
-                stop, reason = Stop.CONVERGED, f"converged: {found}"
+                stop = Stop.CONVERGED
+                reason = f"converged: what is left is {left:.2g} voxel rms, {share:.2g} of the standard deviations"
                 break
             if moves == self.most_passes:
                 break
-            moved, equations = self._carefully(problem, equations, amplitude, wanted)
-            last, amplitude = _rms(moved - amplitude), moved
+            amplitude, equations = self._carefully(problem, equations, amplitude, wanted)
             rms.append(equations.rms)
         with _one_thread():
             known = _known(fit, noise, slow, equations.matrix)
@@ -164,7 +163,7 @@ class Smoother(Solver):
             rms=np.array(rms),
             stop=stop,
             stop_reason=f"{reason}; {_in_words(fit.deviations)}",
-            last_change_voxel=last,
+            last_change_voxel=left,
             known=known,
         )
 
