@@ -192,7 +192,7 @@ def record(
     hits = zingers(conditions.panel, counts.shape, conditions.pixel_mm, conditions.exposure_s, of_hits)
     if hits is not None:
         counts += hits / np.float32(detector.frames)
-    return _stored(np.minimum(counts, np.float32(conditions.panel.saturation_counts)), maps)
+    return _stored(counts, maps, int(conditions.panel.saturation_counts))
 
 
 def expose_flat(
@@ -254,9 +254,9 @@ def _counts(
     return counts.astype(np.float32, copy=False)
 
 
-def _stored(counts: NDArray[np.float32], maps: DetectorMaps) -> NDArray[np.uint16]:
-    rounded = np.clip(np.rint(counts), 0, _FULL_SCALE).astype(np.uint16)
-    rounded[maps.hot] = _FULL_SCALE
+def _stored(counts: NDArray[np.float32], maps: DetectorMaps, most: int) -> NDArray[np.uint16]:
+    rounded = np.clip(np.rint(counts), 0, most).astype(np.uint16)
+    rounded[maps.hot] = most
     return rounded
 
 

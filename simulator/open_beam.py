@@ -81,4 +81,4 @@ class OpenBeam(Settings):
 
 def _from_middle(count: int) -> NDArray[np.float64]:
     """Return the numbers of pixels counted from the middle of a row of them (count,)."""
-    return np.arange(count) - (count - 1) / 2
+    return np.arange(count, dtype=np.float64) - (count - 1) / 2

@@ -48,7 +48,7 @@ class Panel(Settings):
     """share of the signal that is missing at counts_full; half as much is missing at half of it"""
     nonlinearity_spread: Annotated[float, Field(ge=0, le=1)] = 0.0
     """standard deviation of that share from pixel to pixel, over its mean"""
-    saturation_counts: Annotated[float, Field(gt=0, le=65535)] = 65535.0
+    saturation_counts: Annotated[float, Field(ge=1, le=65535)] = 65535.0
     """most counts that a pixel tells, its dark level among them"""
     zingers_per_cm2_min: NotNegative = 0.0
     """particles that hit the panel itself, for each cm2 and minute"""
