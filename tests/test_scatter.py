@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from simulator.images import clear_image, prepare
 from simulator.scatter import Scatter
-from simulator.scenario import course_of
+from simulator.scenario import course_of, load_scenario
 from tests.laws import law
 from tests.tiny_scenarios import tinier
 
@@ -57,3 +57,16 @@ def test_scatter_is_part_of_the_image_of_a_scenario():
         images.append(clear_image(bench, bench.body, 0.3, 0.0))
     np.testing.assert_allclose(images[1], Scatter(ratio=0.3, width_mm=40.0).on(images[0], 7.1), atol=1e-6)
     assert (images[1] / images[0]).max() > 1.05
+
+
+def test_the_law_is_that_of_a_published_monte_carlo_computation():
+    """Steps of an iron wedge at 200 kV behind 2 mm of copper: primary over open beam, scattered over primary.
+
+    Means of two programs: the reference of test 2D-SW-2, scenario 4, in CTSimU's toolbox 1.7.0 (Apache-2.0).
+    """
+    primary = np.array([0.1289, 0.1606, 0.2012, 0.2540, 0.3230, 0.4154, 0.5420, 0.7222], dtype=np.float32)
+    ratio = np.array([0.0944, 0.0896, 0.0774, 0.0635, 0.0495, 0.0362, 0.0244, 0.0150])
+    laboratory = load_scenario("laboratory").scanner.scatter
+    found = [laboratory.on(np.full((4, 4), each), 1.2)[0, 0] / each - 1 for each in primary]
+    np.testing.assert_allclose(found, ratio, rtol=0.14)
+    assert np.mean(found / ratio) == pytest.approx(1, abs=0.02)
