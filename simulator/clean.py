@@ -98,7 +98,7 @@ def _depends_on(scenario: Scenario, stack: Stack) -> dict[str, Any]:
         "stack": [stack.kind, stack.step, image_count(scenario, stack)],
         # the name may be that of a file, whose content may change
         "spectrum": [spectrum.energy_keV.tolist(), spectrum.fluence.tolist()],
-        "blur_px": scenario.detector.blur_px,
+        "blur_px": [scenario.detector.blur_px, scenario.scanner.panel.scintillator_blur_px],
         **scenario.model_dump(mode="json", include=parts),
         # faults of the panel, lag and the open beam come with the noise
         "scanner": scenario.scanner.model_dump(mode="json", include={"stage", "focal_spot", "scatter"}),

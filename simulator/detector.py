@@ -29,7 +29,7 @@ from pydantic import Field, model_validator
 from pdvc.geometry import ConeBeam
 from pdvc.settings import Settings
 from simulator.open_beam import OpenBeam
-from simulator.panel import Panel, PanelMaps, panel_maps, spread, zingers
+from simulator.panel import Panel, PanelMaps, correlated, panel_maps, zingers
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -185,7 +185,9 @@ def record(
     light = conditions.beam.light(conditions.time_s, detector.frames, image.shape[1], of_tube)
     if light is not None:
         photons *= light
-    detected = spread(rng.poisson(photons).astype(np.float32), conditions.panel.scintillator_blur_px)
+    detected = rng.poisson(photons).astype(np.float32)
+    if conditions.panel.scintillator_blur_px > 0:
+        detected = photons + correlated(detected - photons, conditions.panel.scintillator_blur_px)
     counts = _counts(detected / np.float32(detector.frames), detector, maps, conditions.time_s)
     deviation = detector.readout_noise_counts / math.sqrt(detector.frames)
     counts += np.float32(deviation) * rng.standard_normal(counts.shape, dtype=np.float32)

@@ -37,7 +37,7 @@ class Scanner:
     """The true geometry, but for what only the aligner tells."""
     aligner: Aligner
     optics: Detector
-    """The detector, as blurred as the focal spot makes it."""
+    """The detector, as blurred as focal spot and scintillator make it."""
     table: TransmissionTable
     maps: DetectorMaps
 
@@ -72,11 +72,11 @@ def aligner_of(scenario: Scenario) -> Aligner:
 
 
 def _optics(scenario: Scenario, geometry: ConeBeam) -> Detector:
-    """Return the detector with the blur of the focal spot added to its own, by squares."""
-    of_spot = scenario.scanner.focal_spot.blur_px(geometry)
-    if of_spot == 0:
+    """Return the detector with the blur of focal spot and scintillator added to its own, by squares."""
+    more = scenario.scanner.focal_spot.blur_px(geometry), scenario.scanner.panel.scintillator_blur_px
+    if not any(more):
         return scenario.detector
-    return scenario.detector.model_copy(update={"blur_px": math.hypot(scenario.detector.blur_px, of_spot)})
+    return scenario.detector.model_copy(update={"blur_px": math.hypot(scenario.detector.blur_px, *more)})
 
 
 def maps_of(scenario: Scenario) -> DetectorMaps:

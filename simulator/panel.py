@@ -1,12 +1,13 @@
 """The flat panel's faults, in the order in which they happen to the light of a frame.
 
-1. *Correlated noise.* A photon is absorbed in one place of the scintillator, and its light spreads from there: the
-   noise of the photons is blurred with the image. A pixel gets of another, m pixels away, the share
+1. *Correlated noise.* A photon is absorbed in one place of the scintillator, and its light, a Gaussian, spreads from
+   there over the pixels: the image is blurred, and the noise with it. Of photons that fall anywhere alike, two pixels
+   that are m pixels apart see in common
 
-       k(m) = integral of tri(x - m) N(x; 0, blur^2) dx        along rows and columns alike,
+       c(m) = integral of tri(x - m) N(x; 0, 2 blur^2) dx        along rows and columns alike,
 
-   (tri: the pixel's box with that of the other), so that the noise has the autocorrelation k * k, and its variance is
-   (sum k^2)^2 of that without blur.
+   with tri the box of a pixel with itself: c(i) c(j) is the covariance of their noise over its variance without blur.
+   It is made by a filter h with h * h = c, whose transform is the root of that of c.
 2. *Gain drift.* t seconds after the flats a pixel's gain is g (1 + d t), d normal: what flats do not correct is a
    ring in the reference volume.
 3. *Non-linearity.* A signal s becomes s (1 - c s / full): c = nonlinearity (1 + spread N(0, 1)) is the share that is
@@ -22,6 +23,7 @@ Clusters and lines of bad pixels see no light, as bad pixels do.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated
 
 import numpy as np
@@ -41,7 +43,7 @@ class Panel(Settings):
     """Faults of the flat panel; none by default."""
 
     scintillator_blur_px: Annotated[float, Field(ge=0, le=50)] = 0.0
-    """standard deviation of the light's spread after photons are detected, pixels"""
+    """standard deviation of the spread of light that photons make in the scintillator, pixels"""
     gain_drift_per_hour: Annotated[float, Field(ge=0, le=0.2)] = 0.0
     """standard deviation of the change of the pixels' gain since the flats, share of it in an hour"""
     nonlinearity: Annotated[float, Field(ge=-0.2, le=0.2)] = 0.0
@@ -93,25 +95,33 @@ def panel_maps(panel: Panel, rows: int, columns: int, rng: np.random.Generator) 
     )
 
 
-def light_kernel(blur_px: float) -> NDArray[np.float64]:
-    """Return k(m), -reach <= m <= reach, of sum 1: the light of evenly lit pixels that reaches one m pixels away.
+def covariance(blur_px: float, reach: int) -> NDArray[np.float64]:
+    """Return c(m), -reach <= m <= reach, of a blur above 0.
 
     The second difference of the second integral of the Gaussian, x Phi(x / s) + s phi(x / s).
     """
-    reach = int(np.ceil(5 * blur_px)) + 1
-    x = np.arange(-reach - 1, reach + 2) / max(blur_px, 1e-6)
-    ramp = x * (1 + erf(x / np.sqrt(2))) / 2 + np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
-    kernel = np.diff(ramp * blur_px, 2)
-    return np.asarray(kernel / kernel.sum())
+    s = np.sqrt(2) * blur_px
+    x = np.arange(-reach - 1, reach + 2) / s
+    ramp = s * (x * (1 + erf(x / np.sqrt(2))) / 2 + np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi))
+    return np.asarray(np.diff(ramp, 2))
 
 
-def spread(light: Image, blur_px: float) -> Image:
-    """Spread the light of each pixel (row, column) over its neighbours; the edge's goes on beyond it."""
+@cache
+def noise_filter(blur_px: float) -> NDArray[np.float64]:
+    """Return h(m), -reach <= m <= reach, with h * h = c, of a blur above 0."""
+    # tails of the root fall off by a constant factor from pixel to pixel, not like a Gaussian
+    reach = int(np.ceil(8 * blur_px)) + 12
+    transform = np.fft.rfft(np.fft.ifftshift(covariance(blur_px, reach))).real
+    return np.fft.fftshift(np.fft.irfft(np.sqrt(np.maximum(transform, 0)), 2 * reach + 1))
+
+
+def correlated(noise: Image, blur_px: float) -> Image:
+    """Correlate the noise of photons (row, column) by the spread of their light; beyond the edge it is mirrored."""
     if blur_px == 0:
-        return light
-    kernel = light_kernel(blur_px)
-    across = correlate1d(light, kernel, axis=1, mode="nearest")
-    return np.asarray(correlate1d(across, kernel, axis=0, mode="nearest"), dtype=np.float32)
+        return noise
+    kernel = noise_filter(blur_px)
+    across = correlate1d(noise, kernel, axis=1, mode="mirror")
+    return np.asarray(correlate1d(across, kernel, axis=0, mode="mirror"), dtype=np.float32)
 
 
 def zingers(

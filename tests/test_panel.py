@@ -8,8 +8,11 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from simulator.detector import Conditions, Detector, detector_maps, faulty, record
-from simulator.panel import Panel, light_kernel, panel_maps, spread, zingers
+from simulator.images import prepare
+from simulator.panel import Panel, correlated, covariance, noise_filter, panel_maps, zingers
+from simulator.scenario import course_of
 from tests.laws import law
+from tests.tiny_scenarios import tinier
 
 QUIET = Detector(
     bad_pixel_fraction=0.0, gain_spread=0.0, beam_falloff=0.0, readout_noise_counts=0.0, photons_per_pixel=1e9
@@ -27,50 +30,74 @@ def signal(*args, **kwargs):
     return taken(*args, **kwargs) - QUIET.dark_counts
 
 
+@law(12)
+@given(st.floats(0.02, 2.0))
+def test_what_two_pixels_see_in_common_is_the_integral_of_their_light(blur_px):
+    """Light of photons at x, Gaussian, in pixels at 0 and at m: over all x the integral of their shares' product."""
+    c = covariance(blur_px, 3)
+
+    def share(x, m):
+        return norm.cdf((m + 0.5 - x) / blur_px) - norm.cdf((m - 0.5 - x) / blur_px)
+
+    for m in range(3):
+        edges = np.sort([-0.5, 0.5, m - 0.5, m + 0.5])
+        expected = quad(lambda x, m=m: share(x, 0) * share(x, m), -12, 12, points=edges, epsabs=1e-9, limit=400)[0]
+        assert c[3 + m] == pytest.approx(expected, abs=1e-6)
+        assert c[3 - m] == pytest.approx(expected, abs=1e-6)
+
+
 @law(30)
-@given(st.floats(0.05, 2.0))
-def test_the_share_of_a_pixel_in_another_is_the_integral_of_its_light(blur_px):
-    kernel = light_kernel(blur_px)
-    reach = len(kernel) // 2
-    for m in range(min(reach, 3) + 1):
-        # breaks where the triangle bends
-        expected, _ = quad(
-            lambda x, m=m: max(1 - abs(x - m), 0) * norm.pdf(x, scale=blur_px),
-            m - 1,
-            m + 1,
-            points=[m, 0.0] if m < 2 else [m],
-            epsabs=1e-9,
-        )
-        assert kernel[reach + m] == pytest.approx(expected, abs=1e-6)
-    np.testing.assert_allclose(kernel, kernel[::-1], atol=1e-12)
-    if blur_px >= 1:
-        # wide beside a pixel: variances of Gaussian and triangle add up
-        assert kernel @ (np.arange(len(kernel)) - reach) ** 2 == pytest.approx(blur_px**2 + 1 / 6, rel=1e-3)
+@given(st.floats(0.02, 3.0))
+def test_the_filter_with_itself_is_the_covariance(blur_px):
+    h = noise_filter(blur_px)
+    reach = len(h) // 2
+    twice = np.convolve(h, h)[reach : 3 * reach + 1]
+    np.testing.assert_allclose(twice, covariance(blur_px, reach), atol=2e-6)
+    assert h.sum() == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 1.0])
 def test_noise_before_the_blur_is_correlated_after_it(blur_px):
     counts = taken(Panel(scintillator_blur_px=blur_px), 0.5, NOISY, (400, 300))
-    noise = counts - counts.mean()
-    kernel = light_kernel(blur_px)
-    of_lag = np.correlate(kernel, kernel, "full")
-    middle = len(of_lag) // 2
+    noise, c = counts - counts.mean(), covariance(blur_px, 3)[3:]
     variance = 0.5 * NOISY.photons_per_pixel / NOISY.photons_per_count**2
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1), (0, 2)):
-        expected = variance * of_lag[middle + down] * of_lag[middle + right]
         found = np.mean(noise[: 400 - down, : 300 - right] * noise[down:, right:])
         # 120000 products; rounding adds 1 / 12 to the variance alone
-        assert found == pytest.approx(expected, abs=4 * variance * of_lag[middle] ** 2 / np.sqrt(1.2e5) + 0.1)
+        assert found == pytest.approx(variance * c[down] * c[right], abs=4 * variance * c[0] ** 2 / np.sqrt(3e4))
 
 
-def test_the_blur_after_the_photons_blurs_the_image_as_much():
-    light = np.zeros((21, 21), dtype=np.float32)
-    light[10, 10] = 1.0
-    blurred, kernel = spread(light, 0.8), light_kernel(0.8)
-    middle = slice(10 - len(kernel) // 2, 11 + len(kernel) // 2)
-    np.testing.assert_allclose(blurred[middle, middle], np.outer(kernel, kernel), atol=1e-6)
-    assert blurred.sum() == pytest.approx(1, abs=1e-5)
-    assert spread(light, 0.0) is light
+def test_photons_one_by_one_leave_the_same_noise():
+    """Each photon at a place of its own, its light put into the pixels by hand: no filter, no covariance."""
+    rng, blur_px, side, reach = np.random.default_rng(0), 0.5, 120, 3
+    at = rng.uniform(0, side, (2, 30 * side * side))
+    pixel = np.floor(at).astype(int) + np.arange(-reach, reach + 1)[:, None, None]
+    share = norm.cdf((pixel + 1 - at) / blur_px) - norm.cdf((pixel - at) / blur_px)
+    counts = np.zeros(side * side)
+    for row, of_row in zip(pixel[:, 0], share[:, 0], strict=True):
+        for column, of_column in zip(pixel[:, 1], share[:, 1], strict=True):
+            # those that leave the image come in on the other side
+            place = row % side * side + column % side
+            counts += np.bincount(place, of_row * of_column, side * side)
+    counts = counts.reshape(side, side)
+    noise, c = counts - 30.0, covariance(blur_px, 3)[3:]
+    for down, right in ((0, 0), (0, 1), (1, 1)):
+        found = np.mean(noise * np.roll(noise, (down, right), (0, 1))) / 30
+        assert found == pytest.approx(c[down] * c[right], abs=4 * c[0] ** 2 / np.sqrt(side * side / 4))
+
+
+def test_the_image_is_blurred_as_its_noise_is():
+    plain, spreading = (
+        prepare(scenario, course_of(scenario))
+        for scenario in (
+            tinier(detector={"blur_px": 0.3}),
+            tinier(detector={"blur_px": 0.3}, scanner={"panel": {"scintillator_blur_px": 0.4}}),
+        )
+    )
+    assert plain.optics.blur_px == 0.3
+    assert spreading.optics.blur_px == pytest.approx(0.5)
+    still = np.ones((3, 4), dtype=np.float32)
+    assert correlated(still, 0.0) is still
 
 
 def test_gains_that_drift_leave_a_pattern_that_grows_with_time():
