@@ -111,7 +111,6 @@ class Late:
     def _kept_at(self, index: int) -> list[Image]:
         """Return m of each part at an image, from the first image on where nobody has come so far."""
         if index < self._next and index not in self._kept:
-            self._kept.clear()
             self._next = 0
         if self._next == 0:
             before = self._before()

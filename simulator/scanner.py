@@ -42,7 +42,7 @@ from simulator.scenario import Course, Scenario, course_of
 from simulator.side_by_side import in_order
 from simulator.stacks import Image, Stack, clear_images, conditions_of, exposed, image_count, late_images, stacks_of
 from simulator.streams import stream
-from simulator.true_geometry import true_geometry, write_geometry
+from simulator.true_geometry import GEOMETRY, true_geometry, write_geometry
 from simulator.truth import DISPLACEMENT, SCENARIO, read_scenario, sample_truth, write_scenario, write_truth
 
 Floats = NDArray[np.float64]
@@ -69,7 +69,8 @@ def simulate(
     and OSError where it cannot be written; a full disk is answered with the room that is needed.
     """
     check_folder(scenario, folder)
-    if all((folder / name).is_file() for name in (DESCRIPTION, DISPLACEMENT, FLATS, DARKS, *_stacks(scenario))):
+    whole = DESCRIPTION, DISPLACEMENT, GEOMETRY, FLATS, DARKS, *_stacks(scenario)
+    if all((folder / name).is_file() for name in whole):
         return
     with held(folder), _full_disk_explained(scenario, folder):
         (folder / DESCRIPTION).unlink(missing_ok=True)

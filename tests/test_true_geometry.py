@@ -66,6 +66,15 @@ def test_a_folder_without_the_true_geometry_says_so(tmp_path):
         read_geometry(tmp_path)
 
 
+def test_a_folder_that_lost_the_true_geometry_is_completed(tmp_path):
+    simulate(tinier(), tmp_path, workers=1)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.tif")}
+    (tmp_path / GEOMETRY).unlink()
+    simulate(tinier(), tmp_path, workers=1)
+    assert set(read_geometry(tmp_path)) == {"reference", "test"}
+    assert {path: path.read_bytes() for path in before} == before
+
+
 def test_the_clock_goes_on_through_scans_on_the_way():
     scenario = tinier(interrupted=HELD)
     clock = [clock_s(scenario, Stack("test"), step) for step in range(20)]
@@ -78,6 +87,12 @@ def test_the_clock_goes_on_through_scans_on_the_way():
     for held in (3, 13):
         views = [clock_s(scenario, Stack("interrupted", held), view) for view in range(6)]
         np.testing.assert_allclose(views, clock[held] + 3.0 * np.arange(6))
+
+
+def test_backlash_is_in_the_test_and_in_the_scans_on_the_way_alone():
+    scenario = tinier(interrupted=HELD, scanner={"stage": {"backlash_deg": 0.3}})
+    for stack, due in ((Stack("reference"), 0.0), (Stack("test"), 0.3), (Stack("interrupted", 3), 0.3)):
+        assert moment_of(scenario, stack, 2).angle_error_rad == pytest.approx(np.deg2rad(due))
 
 
 def test_a_repetition_and_the_other_images_leave_what_the_stage_does():
