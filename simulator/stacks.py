@@ -58,8 +58,7 @@ def image_s(scenario: Scenario, stack: Stack) -> float:
 
 
 def clock_s(scenario: Scenario, stack: Stack, index: int) -> float:
-    """Return when an image is taken, s since the flats: they, the reference scan and the test follow each other at
-    once.
+    """Return when an image is taken, s since the flats, which the reference scan and then the test follow at once.
 
     The test's own clock stands still during an interrupted scan, this one goes on.
     """
