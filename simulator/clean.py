@@ -22,7 +22,7 @@ from pdvc.progress import Progress, silent
 from simulator.images import prepare
 from simulator.scenario import Scenario, course_of
 from simulator.side_by_side import in_order
-from simulator.stacks import Stack, clear_images, image_count
+from simulator.stacks import Stack, clear_images, clock_s, image_count
 from simulator.xray import read_spectrum
 
 _EVERY_IMAGE = ("subpixels", "exposure_samples", "exposure_share", "start_deg")
@@ -85,6 +85,7 @@ def _compute(scenario: Scenario, stack: Stack, path: Path, progress: Progress, w
 
 def _depends_on(scenario: Scenario, stack: Stack) -> dict[str, Any]:
     parts, plan = {"seed", "specimen", "graphite", "geometry", "misalignment", "xray"}, set(_EVERY_IMAGE)
+    drifts = any(scenario.scanner.focal_spot.drift_mm)
     opening = set(_OPENING)
     if stack.kind != "reference":
         # motion refers to the height that the discarded rows leave
@@ -97,8 +98,11 @@ def _depends_on(scenario: Scenario, stack: Stack) -> dict[str, Any]:
         "stack": [stack.kind, stack.step, image_count(scenario, stack)],
         # the name may be that of a file, whose content may change
         "spectrum": [spectrum.energy_keV.tolist(), spectrum.fluence.tolist()],
-        "blur_px": scenario.detector.blur_px,
+        "blur_px": [scenario.detector.blur_px, scenario.scanner.panel.scintillator_blur_px],
         **scenario.model_dump(mode="json", include=parts),
+        # faults of the panel, lag and the open beam come with the noise
+        "scanner": scenario.scanner.model_dump(mode="json", include={"stage", "focal_spot", "scatter"}),
+        "time_s": [clock_s(scenario, stack, index) for index in range(image_count(scenario, stack)) if drifts],
         "crack": scenario.crack.model_dump(mode="json", exclude=opening),
         "acquisition": scenario.acquisition.model_dump(mode="json", include=plan),
     }

@@ -7,6 +7,9 @@ For a transmission T at sub-pixel centres, n averaged frames and the pixel maps 
     counts = gain N / (n photons_per_count) + readout / sqrt(n) * normal + dark
     stored = counts rounded, and clipped to 0 .. 65535.
 
+What a real tube and panel add to this order is told in `simulator.open_beam` and `simulator.panel`; it comes with the
+`Conditions` of an image.
+
 The mean of n frames of Poisson(m) is Poisson(n m) / n, and the mean of n readouts of deviation s is one
 readout of deviation s / sqrt(n): drawing the mean at once changes nothing. "Photons" are independent quanta;
 for an energy-integrating scintillator they are the number that gives the same signal-to-noise ratio.
@@ -15,7 +18,7 @@ for an energy-integrating scintillator they are the number that gives the same s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Self
 
 import numba
@@ -25,6 +28,8 @@ from pydantic import Field, model_validator
 
 from pdvc.geometry import ConeBeam
 from pdvc.settings import Settings
+from simulator.open_beam import OpenBeam
+from simulator.panel import Panel, PanelMaps, correlated, panel_maps, zingers
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -86,6 +91,25 @@ class DetectorMaps:
     """Pixels that see no light."""
     hot: NDArray[np.bool_]
     """Pixels that are always saturated."""
+    faults: PanelMaps | None = None
+    """What the faults of the panel are from pixel to pixel; None of a panel without faults."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditions:
+    """What an image is taken with beside the detector, and when; without imperfections by default."""
+
+    beam: OpenBeam = field(default_factory=OpenBeam)
+    panel: Panel = field(default_factory=Panel)
+    pixel_mm: float = 1.0
+    """Pitch of the pixels, mm."""
+    time_s: float = 0.0
+    """Time since the flats, s."""
+    exposure_s: float = 1.0
+    """Time that all frames take together, s."""
+
+
+IDEAL = Conditions()
 
 
 def detector_maps(detector: Detector, rows: int, columns: int, rng: np.random.Generator) -> DetectorMaps:
@@ -101,6 +125,15 @@ def detector_maps(detector: Detector, rows: int, columns: int, rng: np.random.Ge
         dead=lot < detector.bad_pixel_fraction / 2,
         hot=lot > 1 - detector.bad_pixel_fraction / 2,
     )
+
+
+def faulty(maps: DetectorMaps, panel: Panel, rng: np.random.Generator) -> DetectorMaps:
+    """Draw the faults of a panel, and add them to what differs from pixel to pixel."""
+    if panel == Panel():
+        return maps
+    rows, columns = maps.gain.shape
+    faults = panel_maps(panel, rows, columns, rng)
+    return replace(maps, dead=maps.dead | faults.dead, faults=faults)
 
 
 def focal_blur_px(focal_spot_mm: float, geometry: ConeBeam) -> float:
@@ -139,25 +172,45 @@ def seen(
 
 
 def record(
-    image: NDArray[np.float32], detector: Detector, maps: DetectorMaps, rng: np.random.Generator
+    image: NDArray[np.float32],
+    detector: Detector,
+    maps: DetectorMaps,
+    rng: np.random.Generator,
+    conditions: Conditions = IDEAL,
 ) -> NDArray[np.uint16]:
     """Make one stored image, counts (rows, columns), from what its pixels see, as `seen` returns it."""
+    # of their own, so that photons and readout stay the same whatever else happens
+    of_tube, of_hits = rng.spawn(2)
     photons = _photons(image, detector, maps) * detector.frames
+    light = conditions.beam.light(conditions.time_s, detector.frames, image.shape[1], of_tube)
+    if light is not None:
+        photons *= light
     detected = rng.poisson(photons).astype(np.float32)
-    counts = _counts(detected / np.float32(detector.frames), detector, maps)
+    if conditions.panel.scintillator_blur_px > 0:
+        detected = photons + correlated(detected - photons, conditions.panel.scintillator_blur_px)
+    counts = _counts(detected / np.float32(detector.frames), detector, maps, conditions.time_s)
     deviation = detector.readout_noise_counts / math.sqrt(detector.frames)
     counts += np.float32(deviation) * rng.standard_normal(counts.shape, dtype=np.float32)
-    return _stored(counts, maps)
+    hits = zingers(conditions.panel, counts.shape, conditions.pixel_mm, conditions.exposure_s, of_hits)
+    if hits is not None:
+        counts += hits / np.float32(detector.frames)
+    return _stored(counts, maps, int(conditions.panel.saturation_counts))
 
 
-def expose_flat(detector: Detector, maps: DetectorMaps, rng: np.random.Generator) -> NDArray[np.uint16]:
+def expose_flat(
+    detector: Detector, maps: DetectorMaps, rng: np.random.Generator, conditions: Conditions = IDEAL
+) -> NDArray[np.uint16]:
     """Make one stored image (rows, columns) without the sample."""
-    return expose(np.ones(maps.gain.shape, dtype=np.float32), detector, maps, 1, rng)
+    image = seen(np.ones(maps.gain.shape, dtype=np.float32), detector, maps, 1)
+    return record(image, detector, maps, rng, conditions)
 
 
-def expose_dark(detector: Detector, maps: DetectorMaps, rng: np.random.Generator) -> NDArray[np.uint16]:
+def expose_dark(
+    detector: Detector, maps: DetectorMaps, rng: np.random.Generator, conditions: Conditions = IDEAL
+) -> NDArray[np.uint16]:
     """Make one stored image (rows, columns) without X-rays."""
-    return expose(np.zeros(maps.gain.shape, dtype=np.float32), detector, maps, 1, rng)
+    image = seen(np.zeros(maps.gain.shape, dtype=np.float32), detector, maps, 1)
+    return record(image, detector, maps, rng, conditions)
 
 
 def expected(
@@ -192,15 +245,20 @@ def _photons(image: NDArray[np.float32], detector: Detector, maps: DetectorMaps)
     return photons
 
 
-def _counts(photons: NDArray[np.float32], detector: Detector, maps: DetectorMaps) -> NDArray[np.float32]:
+def _counts(
+    photons: NDArray[np.float32], detector: Detector, maps: DetectorMaps, time_s: float = 0.0
+) -> NDArray[np.float32]:
     lit = np.where(maps.dead, np.float32(0), photons * maps.gain)
+    if maps.faults is not None:
+        lit *= 1 + maps.faults.gain_per_hour * np.float32(time_s / 3600)
+        lit *= 1 - maps.faults.curvature * (lit / np.float32(detector.photons_per_pixel))
     counts = lit / detector.photons_per_count + detector.dark_counts
     return counts.astype(np.float32, copy=False)
 
 
-def _stored(counts: NDArray[np.float32], maps: DetectorMaps) -> NDArray[np.uint16]:
-    rounded = np.clip(np.rint(counts), 0, _FULL_SCALE).astype(np.uint16)
-    rounded[maps.hot] = _FULL_SCALE
+def _stored(counts: NDArray[np.float32], maps: DetectorMaps, most: int) -> NDArray[np.uint16]:
+    rounded = np.clip(np.rint(counts), 0, most).astype(np.uint16)
+    rounded[maps.hot] = most
     return rounded
 
 

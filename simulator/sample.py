@@ -1,4 +1,4 @@
-"""The sample: at rest, as it is moved at a step of the test, and leaning with the rotation axis."""
+"""The sample: at rest, as it is moved at a step of the test, leaning with the rotation axis, and anywhere else."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from simulator.crack import NONE, Crack, keep_clear, spheroids
 from simulator.each_point import products
-from simulator.kinematics import Motion, rotation_matrix
+from simulator.kinematics import Floats, Motion, rotation_matrix
 from simulator.microstructure import place
 from simulator.radiography import Body
 from simulator.scenario import Scenario
@@ -53,11 +53,16 @@ def leaning_body(body: Body, lean_rad: float, angle_rad: float) -> Body:
         return body
     column = np.array([-math.sin(angle_rad), -math.cos(angle_rad), 0.0])
     matrix = rotation_matrix(lean_rad * column)
+    return placed(body, matrix, np.zeros(3))
+
+
+def placed(body: Body, matrix: Floats, place_mm: Floats) -> Body:
+    """Turn a sample by a matrix (3, 3), and shift it (3,), mm."""
     return Body(
-        vertices_mm=body.vertices_mm @ matrix.T,
+        vertices_mm=body.vertices_mm @ matrix.T + place_mm,
         faces=body.faces,
-        centres_mm=body.centres_mm @ matrix.T,
+        centres_mm=body.centres_mm @ matrix.T + place_mm,
         shapes_mm=matrix @ body.shapes_mm,
-        crack_centres_mm=body.crack_centres_mm @ matrix.T,
+        crack_centres_mm=body.crack_centres_mm @ matrix.T + place_mm,
         crack_shapes_mm=matrix @ body.crack_shapes_mm,
     )

@@ -1,6 +1,6 @@
 """Carry out a scenario: write an experiment folder and the truth beside it.
 
-Files are written in this order: the scenario, the true displacements, flats, darks, reference scan, test,
+Files are written in this order: the scenario, the true displacements and geometry, flats, darks, reference scan, test,
 interrupted scans, and last `experiment.toml`, which declares the folder complete. Every image has its own random
 generator, seeded by (seed, stack, number): counts depend neither on the number of workers nor on interruptions,
 and a run that was interrupted goes on where it stopped.
@@ -40,8 +40,9 @@ from simulator.detector import DetectorMaps, expose_dark, expose_flat
 from simulator.images import Clear, maps_of, prepare
 from simulator.scenario import Course, Scenario, course_of
 from simulator.side_by_side import in_order
-from simulator.stacks import Image, Stack, clear_images, exposed, image_count, stacks_of
+from simulator.stacks import Image, Stack, clear_images, conditions_of, exposed, image_count, late_images, stacks_of
 from simulator.streams import stream
+from simulator.true_geometry import GEOMETRY, true_geometry, write_geometry
 from simulator.truth import DISPLACEMENT, SCENARIO, read_scenario, sample_truth, write_scenario, write_truth
 
 Floats = NDArray[np.float64]
@@ -68,7 +69,8 @@ def simulate(
     and OSError where it cannot be written; a full disk is answered with the room that is needed.
     """
     check_folder(scenario, folder)
-    if all((folder / name).is_file() for name in (DESCRIPTION, DISPLACEMENT, FLATS, DARKS, *_stacks(scenario))):
+    whole = DESCRIPTION, DISPLACEMENT, GEOMETRY, FLATS, DARKS, *_stacks(scenario)
+    if all((folder / name).is_file() for name in whole):
         return
     with held(folder), _full_disk_explained(scenario, folder):
         (folder / DESCRIPTION).unlink(missing_ok=True)
@@ -117,17 +119,25 @@ def _write_all(scenario: Scenario, folder: Path, progress: Progress, workers: in
     progress("sample", 0, 1)
     course = course_of(scenario)
     write_truth(folder, sample_truth(scenario, course))
+    write_geometry(folder, true_geometry(scenario, course))
     detector, maps = scenario.detector, maps_of(scenario)
     clear_of = _clear_stacks(scenario, course, progress, workers, clean)
     progress("sample", 1, 1)
+    conditions = conditions_of(scenario, 0.0, scenario.acquisition.reference_view_s)
     without_sample: tuple[tuple[str, str, int, Callable[[int], Image]], ...] = (
-        ("flats", FLATS, detector.flats, lambda k: expose_flat(detector, maps, stream(scenario, "flats", k))),
-        ("darks", DARKS, detector.darks, lambda k: expose_dark(detector, maps, stream(scenario, "darks", k))),
+        (
+            *("flats", FLATS, detector.flats),
+            lambda k: expose_flat(detector, maps, stream(scenario, "flats", k), conditions),
+        ),
+        (
+            *("darks", DARKS, detector.darks),
+            lambda k: expose_dark(detector, maps, stream(scenario, "darks", k), conditions),
+        ),
     )
     for task, name, count, make in without_sample:
         _write_stack(scenario, folder / name, task, count, make, progress, workers)
     for stack, name in zip(stacks_of(scenario), _stacks(scenario), strict=True):
-        make = partial(_noisy, scenario, maps, clear_of(stack), stack)
+        make = partial(_noisy, scenario, maps, late_images(scenario, stack, clear_of), stack)
         _write_stack(scenario, folder / name, str(stack), image_count(scenario, stack), make, progress, workers)
     write_description(folder, describe(scenario, course))
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Self
@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pdvc.experiment import GeometryEntry, check_held_steps
-from pdvc.geometry import ConeBeam
 from pdvc.settings import Settings, SettingsError
 from simulator.crack import Crack, outline_mm
 from simulator.detector import Detector
+from simulator.imperfections import Imperfections
 from simulator.ingredients import Drive, MotionOptions
 from simulator.kinematics import Motion
 from simulator.loading import LoadHistory, Loading, load_history
 from simulator.microstructure import Graphite
+from simulator.misalignment import Misalignment
 from simulator.solver_space import into_sections, time_functions
 from simulator.specimen import Specimen, area_mm2, depth_mm, section_mm
 from simulator.xray import XraySource
@@ -51,31 +52,6 @@ class ScannerGeometry(GeometryEntry):
     """detector rows as stored"""
     columns: Annotated[int, Field(ge=1)] = 432
     """detector columns as stored"""
-
-
-class Misalignment(Settings):
-    """What the true scanner has beyond the recorded geometry, which the measurement is not told."""
-
-    source_axis_mm: float = 0.0
-    """added to the distance from the source to the axis, mm"""
-    column_shift_mm: float = 0.0
-    """added to the detector's shift to the right, mm"""
-    row_shift_mm: float = 0.0
-    """added to the detector's shift downwards, mm"""
-    roll_deg: float = 0.0
-    """added to the detector's turn in its plane, degrees"""
-    lean_deg: float = 0.0
-    """turn of the rotation axis about the horizontal across the beam (e_c), degrees"""
-
-    def true_geometry(self, recorded: ConeBeam) -> ConeBeam:
-        """Return the geometry with which the radiographs are made."""
-        return replace(
-            recorded,
-            source_axis_mm=recorded.source_axis_mm + self.source_axis_mm,
-            column_shift_mm=recorded.column_shift_mm + self.column_shift_mm,
-            row_shift_mm=recorded.row_shift_mm + self.row_shift_mm,
-            roll_rad=recorded.roll_rad + math.radians(self.roll_deg),
-        )
 
 
 class Acquisition(Settings):
@@ -144,6 +120,8 @@ class Scenario(Settings):
     """the beam"""
     detector: Detector = Detector()
     """the detector"""
+    scanner: Imperfections = Imperfections()
+    """what a real scanner does beside making images"""
     acquisition: Acquisition = Acquisition()
     """when radiographs are taken"""
     interrupted: Interrupted = Interrupted()
@@ -174,6 +152,7 @@ class Scenario(Settings):
             )
         self._check_steps()
         self._check_crack()
+        self._check_scanner()
         return self
 
     def _check_steps(self) -> None:
@@ -184,6 +163,14 @@ class Scenario(Settings):
         ):
             if happens and step >= steps:
                 raise ValueError(f"{key} below {steps}, the number of steps of the test, got {step}")
+
+    def _check_scanner(self) -> None:
+        recorded = self.geometry.cone_beam()
+        try:
+            self.misalignment.true_geometry(recorded)
+        except ValueError as error:
+            raise ValueError(f"misalignment of a scanner that there can be, {error}") from None
+        self.scanner.open_beam.heel(recorded)
 
     def _check_crack(self) -> None:
         if self.crack.opening_mm == 0:

@@ -10,7 +10,10 @@ import numpy as np
 
 from simulator.scenario import Scenario
 
-_STREAMS = ("reference", "test", "flats", "darks", "nodules", "maps", "force", "interrupted", "interrupted force")
+_STREAMS = (
+    *("reference", "test", "flats", "darks", "nodules", "maps", "force", "interrupted", "interrupted force"),
+    *("stage", "panel"),
+)
 """What random numbers are drawn for, one stream for each; the order is part of every result."""
 _NOISE = ("reference", "test", "flats", "darks", "force", "interrupted", "interrupted force")
 """Streams that a repetition draws anew."""

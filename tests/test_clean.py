@@ -186,3 +186,49 @@ class TestRepetition:
         drawn = (noise[0] != 0) | (noise[1] != 0)
         assert drawn.sum() > 15000
         assert abs(np.corrcoef(noise[0][drawn], noise[1][drawn])[0, 1]) < 5 / np.sqrt(drawn.sum())
+
+
+REAL = {
+    "stage": {"angle_jitter_deg": 0.05},
+    "focal_spot": {"size_mm": 0.2, "drift_mm": [0.01, 0.0, 0.0]},
+    "scatter": {"ratio": 0.1},
+    "open_beam": {"current_spread": 0.01, "drift_per_hour": 0.1, "target_attenuation": 0.1, "anode_deg": 30.0},
+    "panel": {"scintillator_blur_px": 0.3, "gain_drift_per_hour": 0.1, "nonlinearity": 0.02, "bad_columns": 1},
+    "lag": {"share": 0.1, "afterglow_share": 0.02},
+}
+
+
+def test_counts_of_a_real_scanner_are_those_without_kept_images(tmp_path):
+    real = tiny(scanner=REAL)
+    simulate(real, tmp_path / "kept", clean=tmp_path / "clean", workers=2)
+    simulate(real, tmp_path / "alone", workers=3)
+    for one, two in zip(stacks(tmp_path / "kept"), stacks(tmp_path / "alone"), strict=True):
+        np.testing.assert_array_equal(one, two)
+    simulate(tiny(), tmp_path / "ideal", clean=tmp_path / "clean", workers=2)
+    for name, one, two in zip(ALL, stacks(tmp_path / "kept"), stacks(tmp_path / "ideal"), strict=True):
+        assert np.array_equal(one, two) == (name == DARKS)
+
+
+def test_a_real_scanner_that_was_interrupted_goes_on_to_the_same_counts(tmp_path):
+    def interrupt(name, done, total):
+        if (name, done) == ("test", 7):
+            raise KeyboardInterrupt
+
+    real = tiny(scanner=REAL)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(real, tmp_path / "cut", progress=interrupt, workers=2)
+    simulate(real, tmp_path / "cut", workers=1)
+    simulate(real, tmp_path / "whole", workers=2)
+    for one, two in zip(stacks(tmp_path / "cut"), stacks(tmp_path / "whole"), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_what_comes_with_the_noise_shares_images_and_what_drifts_depends_on_the_time():
+    drifting = {"focal_spot": {"drift_mm": [0.01, 0.0, 0.0]}}
+    sooner = {"acquisition": {"reference_view_s": 1.0}}
+    for stack in STACKS:
+        noise = {part: REAL[part] for part in ("open_beam", "lag")}
+        noise["panel"] = {**REAL["panel"], "scintillator_blur_px": 0.0}
+        assert clean_file(tiny(scanner=noise), stack) == clean_file(tiny(), stack)
+        assert clean_file(tiny(**sooner), stack) == clean_file(tiny(), stack)
+        assert clean_file(tiny(scanner=drifting, **sooner), stack) != clean_file(tiny(scanner=drifting), stack)

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 
 from pdvc.settings import SettingsError
-from simulator.scenario import Misalignment, Scenario, builtin_names, course_of, load_scenario
+from simulator.imperfections import Imperfections
+from simulator.misalignment import Misalignment
+from simulator.scenario import Scenario, builtin_names, course_of, load_scenario
 
 
-@pytest.mark.parametrize("name", ["crack", "in-space", "jailin2018", "neck", "quick", "rigid", "slip", "small"])
+@pytest.mark.parametrize(
+    "name", ["crack", "in-space", "jailin2018", "laboratory", "neck", "quick", "rigid", "slip", "small"]
+)
 def test_builtin_scenarios_load_and_are_named_after_their_file(name):
     assert name in builtin_names()
     assert load_scenario(name).name == name
@@ -109,6 +113,40 @@ def test_the_slip_is_where_its_file_tells():
             r"the sample's surface, got \[0\.0, 0\.0, 0\.0\] mm and 0\.5 mm: 0\.045 mm outside",
         ),
         ("[specimen]\nlength_mm = 5.0", r"expected specimen\.length_mm of at least 10\.\d+ mm"),
+        (
+            "[misalignment]\nsource_detector_mm = -790.0",
+            r"expected misalignment of a scanner that there can be, geometry\.source_detector_mm: expected more than "
+            r"source_axis_mm = 28\.57\d* mm, got 10\.0 mm",
+        ),
+        ("[misalignment]\nskew_deg = 1.0", r"misalignment\.skew_deg: unknown key"),
+        ("[scanner]\nghosts = 1", r"scanner\.ghosts: unknown key"),
+        (
+            "[scanner.stage]\nwobble_deg = -0.1",
+            r"scanner\.stage\.wobble_deg: expected greater than or equal to 0, given -0\.1",
+        ),
+        (
+            "[scanner.stage]\nwobbles_per_turn = 0",
+            r"scanner\.stage\.wobbles_per_turn: expected greater than or equal to 1, given 0",
+        ),
+        ("[scanner.focal_spot]\ndrift_mm = [0.1]", r"scanner\.focal_spot\.drift_mm\.1: missing"),
+        (
+            "[scanner.focal_spot]\ndrift_time_s = 0.0",
+            r"scanner\.focal_spot\.drift_time_s: expected greater than 0, given 0\.0",
+        ),
+        (
+            "[scanner.open_beam]\ntarget_attenuation = 0.1\nanode_deg = 5.0",
+            r"expected scanner\.open_beam\.anode_deg above 10\.\d+ degrees, the beam's half opening towards the "
+            r"anode, got 5\.0 degrees",
+        ),
+        ("[scanner.scatter]\nwidth_mm = 0.0", r"scanner\.scatter\.width_mm: expected greater than 0, given 0\.0"),
+        (
+            "[scanner.panel]\nsaturation_counts = 70000.0",
+            r"scanner\.panel\.saturation_counts: expected less than or equal to 65535, given 70000\.0",
+        ),
+        (
+            "[scanner.lag]\nshare = 0.6\nafterglow_share = 0.4",
+            r"scanner\.lag: expected share and afterglow_share that sum to less than 1, got 0\.6 and 0\.4",
+        ),
         ("discarded_rows = 477", r"discarded_rows below half of the 954 detector rows, got 477"),
         ("[interrupted]\nsteps = [0, 127]", r"expected interrupted\.steps below 127, the number of steps of the test"),
         ("[interrupted]\nsteps = [5, 4]", r"expected interrupted\.steps: increasing step numbers, got 5, 4"),
@@ -156,3 +194,19 @@ def test_the_course_of_in_space_is_a_sum_of_the_papers_time_functions():
 
 def test_defaults_are_plain_toml():
     assert Scenario.parse(tomllib.loads(Scenario().template()), where="here") == Scenario()
+
+
+def test_a_perfect_scanner_is_the_default_of_all_scenarios_but_the_laboratory():
+    for name in builtin_names():
+        scenario = load_scenario(name)
+        real = (scenario.scanner, scenario.misalignment) != (Imperfections(), Misalignment())
+        assert real == (name == "laboratory")
+
+
+def test_the_laboratory_is_quick_with_everything_that_can_go_wrong_in_a_scanner():
+    laboratory, quick = load_scenario("laboratory"), load_scenario("quick")
+    same = ("seed", "specimen", "graphite", "geometry", "xray", "loading", "motion", "crack", "discarded_rows")
+    assert all(getattr(laboratory, key) == getattr(quick, key) for key in same)
+    sizes = {**vars(laboratory.misalignment), **vars(laboratory.scanner)}
+    perfect = {**vars(Misalignment()), **vars(Imperfections())}
+    assert all(sizes[name] != perfect[name] for name in perfect)

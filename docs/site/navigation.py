@@ -5,7 +5,7 @@ from __future__ import annotations
 from sphinx.application import Sphinx
 
 NAVIGATION = {
-    "Start": ["start", "scenarios", "examples"],
+    "Start": ["start", "scenarios", "scanner", "examples"],
     "How to": ["own-radiographs", "live", "walkthrough", "studies", "methods", "extend", "strategies"],
     "Explanation": [
         "equations",
