@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from validation.commands import live, many, one, watching
+from validation.commands import doors, live, many, one, watching
 from validation.commands.parts import Debugging
 
 app = typer.Typer(
@@ -43,6 +43,7 @@ for _command in (
     *(watching.page, watching.watch),
 ):
     app.command()(_command)
+app.command("import")(doors.import_)
 
 
 if __name__ == "__main__":
