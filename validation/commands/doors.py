@@ -152,7 +152,7 @@ def import_(
                 **told(photons_per_count=photons_per_count, readout_noise_counts=readout_noise_counts),
             },
         ).assembled()
-        for note in whole.notes:
-            tell(note)
         write_folder(whole, out, progress=progress)
+    for note in whole.notes:
+        tell(note)
     tell(f"experiment: {out}; look at it before it is measured: pdvc-bench inspect {out}")

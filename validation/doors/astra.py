@@ -42,18 +42,16 @@ def from_cone_vec(vectors: Floats, path: Path | str = "cone_vec") -> tuple[dict[
     beam = np.cross(along_columns, along_rows)
     beam /= np.linalg.norm(beam, axis=1, keepdims=True)
     if np.any(_dots(middle - source, beam) <= 0):
-        raise refused(
-            path, "u, v", "u to the right and v downwards for an eye at the source", "v upwards or u to the left"
-        )
+        expected = "u to the right and v downwards for an eye at the source"
+        raise refused(path, "u, v", expected, "u to the left or v upwards")
     angle = np.unwrap(np.arctan2(-beam[:, 1], beam[:, 0]))
     level, across = directions(angle)
     down = np.array([0.0, 0.0, -1.0])
     beyond = _dots(middle - source, level)
     off = np.abs(np.stack([beam[:, 2], _dots(source, across) / beyond, source[:, 2] / beyond]))
     if off.max() > NEARLY:
-        raise refused(
-            path, "source", "a beam through the z axis, level and normal to the detector", f"{off.max():.2g} off"
-        )
+        expected = "a beam through the z axis, level and normal to the detector"
+        raise refused(path, "source", expected, f"one that is {off.max():.2g} off")
     found = {
         "source_axis_mm": -_dots(source, level),
         "source_detector_mm": beyond,
