@@ -41,6 +41,7 @@ for _command in (
     *(many.compare, many.studies, many.study, many.plan),
     *(live.prepare, live.live, live.play),
     *(watching.page, watching.watch),
+    doors.export,
 ):
     app.command()(_command)
 app.command("import")(doors.import_)

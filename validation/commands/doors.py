@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from validation.commands.parts import answering, tell
+from validation.commands.parts import Options, Threads, answering, read_options, tell, use_threads
+
+
+class Series(StrEnum):
+    """The series of an experiment."""
+
+    REFERENCE = "reference"
+    TEST = "test"
+
 
 _SCAN = (
     "An NXtomo file (FILE::ENTRY chooses one of several), Nikon's .xtekct, North Star's .nsipro, a folder of single "
@@ -156,3 +165,78 @@ def import_(
     for note in whole.notes:
         tell(note)
     tell(f"experiment: {out}; look at it before it is measured: pdvc-bench inspect {out}")
+
+
+def export(
+    source: Annotated[
+        Path, typer.Argument(metavar="FILE|DIR", help="A measurement, as written by measure; or an experiment folder.")
+    ],
+    experiment: Annotated[
+        Path | None,
+        typer.Option("--experiment", metavar="DIR", help="Of a measurement: the folder that was measured."),
+    ] = None,
+    vtk: Annotated[
+        Path | None,
+        typer.Option(
+            "--vtk", metavar="DIR", help="The moving surface for ParaView; with --experiment, the sample's outline."
+        ),
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", help="Displacement and strain as a table of text.")
+    ] = None,
+    parquet: Annotated[
+        Path | None, typer.Option("--parquet", metavar="FILE", help="The same table as Parquet (extra: parquet).")
+    ] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            "--points",
+            metavar="CSV",
+            help="Columns x, y, z with units: where the table asks. Default: between sections.",
+        ),
+    ] = None,
+    gauge_mm: Annotated[
+        float | None,
+        typer.Option("--gauge-mm", metavar="MM", help="Length over which the table's strain is. Default: a section."),
+    ] = None,
+    volume: Annotated[
+        Path | None, typer.Option("--volume", metavar="TIFF", help="The volume at rest, reconstructed, for ImageJ.")
+    ] = None,
+    geometry: Annotated[
+        Path | None,
+        typer.Option("--geometry", metavar="FILE", help="The geometry: .xml for RTK, .csv for ASTRA (cone_vec)."),
+    ] = None,
+    series: Annotated[Series, typer.Option("--series", help="Whose angles --geometry is of.")] = Series.REFERENCE,
+    nxtomo: Annotated[
+        Path | None, typer.Option("--nxtomo", metavar="FILE", help="The experiment as NXtomo (HDF5), two entries.")
+    ] = None,
+    options: Options = "default",
+    work: Annotated[
+        Path | None,
+        typer.Option("--work", metavar="DIR", help="Where measure or prepare kept a volume, to be taken from there."),
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Write a measurement, or an experiment, for other programs: ParaView, tables, ImageJ, ASTRA, RTK, NXtomo.
+
+    Example:  `pdvc-bench export motion.nc --experiment mine --vtk out/vtk --csv out/motion.csv`
+    """
+    with answering() as progress:
+        from validation.doors.export import Export
+
+        use_threads(threads)
+        written = Export(
+            vtk=vtk,
+            csv=csv,
+            parquet=parquet,
+            points=points,
+            gauge_mm=gauge_mm,
+            volume=volume,
+            geometry=geometry,
+            series=series.value,
+            nxtomo=nxtomo,
+            options=read_options(options),
+            work=work,
+        ).write(source, experiment, progress=progress)
+    for path in written:
+        tell(f"written: {path}")
