@@ -175,7 +175,12 @@ def write_north_star(
 
 
 def write_nexus(
-    path: Path, *, flips: tuple[bool, bool] = (False, False), old: bool = False, radians: bool = False
+    path: Path,
+    *,
+    flips: tuple[bool, bool] = (False, False),
+    old: bool = False,
+    esrf: bool = False,
+    radians: bool = False,
 ) -> Written:
     """Write an NXtomo file in the frame of NeXus: x to the left, y up, z along the beam; lengths in m."""
     step, axis_column, axis_row = 30.0, 17.25, 23.75
@@ -207,7 +212,11 @@ def write_nexus(
         ):
             entry[f"instrument/{name}"] = value * 1e-3
             entry[f"instrument/{name}"].attrs["units"] = "m"
-        for name, axis, flip in zip(("x", "y"), ([0, 1, 0], [1, 0, 0]), flips, strict=True):
+        # up and across: of NeXus, or of the files that nxtomo wrote before its version 2.0
+        axes = ([0, 0, 1], [0, 1, 0]) if esrf else ([0, 1, 0], [1, 0, 0])
+        if esrf:
+            entry.attrs["version"] = 1.5
+        for name, axis, flip in zip(("x", "y"), axes, flips, strict=True):
             if old:
                 entry[f"instrument/detector/{name}_flipped"] = flip
             else:

@@ -83,6 +83,10 @@ class TestWhereTheMarkerIsSeen:
         assert (scan.flats.count, scan.darks.count) == (2, 1)
         assert (scan.darks.read(0) == foreign.DARK).all()
 
+    @pytest.mark.parametrize("flips", [(True, False), (False, True)])
+    def test_nxtomo_with_the_axes_of_older_files(self, tmp_path, flips):
+        check_marker(foreign.write_nexus(tmp_path / "scan.nx", flips=flips, esrf=True))
+
     def test_nxtomo_in_radians(self, tmp_path):
         check_marker(foreign.write_nexus(tmp_path / "scan.nxs", radians=True))
 
@@ -220,6 +224,10 @@ DETECTOR = "instrument/detector"
             lambda e: e[f"{DETECTOR}/transformations/flip_x"].write_direct(np.array(17.0)),
             "transformations: expected a turn about y by 0 or 180 degrees, found 17",
         ),
+        (
+            lambda e: e.attrs.__setitem__("NeXus_Coordinate_System", "IEC"),
+            "NeXus_Coordinate_System: expected McStas or ESRF, found 'IEC'",
+        ),
     ],
 )
 def test_wrong_nxtomo_files_are_answered_in_one_line(tmp_path, change, told):
@@ -304,6 +312,13 @@ def test_the_header_of_a_reconstructed_volume_is_no_scan(tmp_path):
     (tmp_path / "volume.nsihdr").write_text("<Volume>")
     with pytest.raises(FormatError, match=r"expected the project of a scan, .nsipro, found the header of a recon"):
         read_scan(str(tmp_path / "volume.nsihdr"))
+
+
+def test_a_geometry_report_is_not_read_and_told(tmp_path):
+    path = foreign.write_north_star(tmp_path).path
+    (tmp_path / "Geometry Report.rtf").write_text("Image center (95.707, 123.072) [mm]")
+    (note,) = read_scan(str(path)).notes
+    assert note.startswith(f"{tmp_path / 'Geometry Report.rtf'}: not read")
 
 
 def test_too_many_folders_of_radiographs_are_told(tmp_path):

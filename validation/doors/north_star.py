@@ -54,6 +54,10 @@ def read_north_star(path: Path) -> Scan:
         flats=None if flat is None else straight(read_tiff_stack(flat)),
         darks=None if dark is None else straight(read_tiff_stack(dark)),
         title=path.stem,
+        notes=tuple(
+            f"{report}: not read; where it places the detector otherwise than {path.name}: --column-shift-mm"
+            for report in sorted(path.parent.glob("Geometry*.rtf"))
+        ),
     )
 
 

@@ -5,8 +5,9 @@ Read are ``instrument/detector``: ``data``, ``image_key`` (0: radiograph, 1: fla
 ``instrument/source/distance``; and ``sample/rotation_angle``, taken as counter-clockwise seen from above, which is
 positive about the vertical axis of NeXus. Images are taken as an eye at the source sees them unless
 ``detector/transformations`` turns them by 180 degrees about the vertical axis, which mirrors columns, or about the
-horizontal one, which mirrors rows (so writes the package nxtomo, its versions 1.3 on; ``x_flipped`` and ``y_flipped``
-before). A turn about the beam is the detector's roll.
+horizontal one, which mirrors rows (so writes the package nxtomo from version 1.3 of its files on; ``x_flipped`` and
+``y_flipped`` before). A turn about the beam is the detector's roll. Axes are those of NeXus, z along the beam and y
+up; in files of nxtomo before version 2.0 that name no other, x is along the beam and z up.
 
 The definition has no place for times and forces. They are written, and read where they are there, as fields
 ``time`` and ``force`` of the entry's ``data`` group, one number for each frame.
@@ -35,6 +36,11 @@ ANGLES = "sample/rotation_angle"
 RADIOGRAPH, FLAT, DARK = 0, 1, 2
 LARGEST_COUNT = 65535
 _WITHIN_DEG = 1e-3
+COORDINATES = "NeXus_Coordinate_System"
+"""Attribute of an entry by which the package nxtomo tells which way its axes run."""
+_BEAM, _UP, _ACROSS = 0, 1, 2
+_AXES = {"McStas": ("z", "y", "x"), "ESRF": ("x", "z", "y")}
+"""Names of the axes along the beam, up and across."""
 
 
 def read_nxtomo(path: Path, entry: str = "", given: Mapping[str, float] | None = None) -> Scan:
@@ -169,7 +175,7 @@ class _Entry:
             distance = f"{DETECTOR}/distance"
             if distance in self._group and "source_detector_mm" not in given:
                 found["source_detector_mm"] = found["source_axis_mm"] + abs(self._length(distance))
-        found["roll_deg"] = self._turn((0.0, 0.0, 1.0))
+        found["roll_deg"] = self._turn(_BEAM)
         pixel_mm = found.get("pixel_mm", given.get("pixel_mm"))
         if pixel_mm is not None:
             found |= self._shifts(size, pixel_mm, math.radians(found["roll_deg"]))
@@ -193,16 +199,25 @@ class _Entry:
                 there and bool(self._dataset(f"{DETECTOR}/{name}_flipped")[()])
                 for name, there in zip("xy", old, strict=True)
             )
-        turns = [self._turn(axis) for axis in ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0))]
-        for axis, turn in zip("yx", turns, strict=True):
+        turns = {axis: self._turn(axis) for axis in (_UP, _ACROSS)}
+        for axis, turn in turns.items():
             if min(abs(turn), abs(abs(turn) - 180)) > _WITHIN_DEG:
                 where = f"{DETECTOR}/transformations"
-                raise self._refused(where, f"a turn about {axis} by 0 or 180 degrees", f"{turn:g}")
-        return abs(turns[0]) > 90, abs(turns[1]) > 90
+                raise self._refused(where, f"a turn about {self._axes()[axis]} by 0 or 180 degrees", f"{turn:g}")
+        return abs(turns[_UP]) > 90, abs(turns[_ACROSS]) > 90
 
-    def _turn(self, axis: tuple[float, float, float]) -> float:
-        """Return by how many degrees the detector is turned about an axis of NeXus: x, y up, z along the beam."""
-        turned = 0.0
+    def _axes(self) -> tuple[str, str, str]:
+        """Return the names of the axes along the beam, up and across."""
+        told = _text(self._group.attrs.get(COORDINATES, ""))
+        if not told:
+            told = "ESRF" if float(self._group.attrs.get("version", 2.0)) < 2.0 else "McStas"
+        if told not in _AXES:
+            raise self._refused(COORDINATES, " or ".join(_AXES), repr(told))
+        return _AXES[told]
+
+    def _turn(self, which: int) -> float:
+        """Return by how many degrees the detector is turned about the axis along the beam, up or across."""
+        turned, axis = 0.0, [float(name == self._axes()[which]) for name in "xyz"]
         transformations = self._group.get(f"{DETECTOR}/transformations", {})
         for name, dataset in transformations.items():
             if _text(dataset.attrs.get("transformation_type", "")) != "rotation" or dataset.shape not in ((), (1,)):
@@ -266,6 +281,7 @@ def _write_entry(entry: h5py.Group, experiment: Experiment, series: Series) -> N
     import h5py
 
     entry.attrs["NX_class"] = "NXentry"
+    entry.attrs[COORDINATES] = "McStas"
     entry["definition"] = "NXtomo"
     entry["title"] = experiment.title
     before = len(experiment.darks) + len(experiment.flats)
