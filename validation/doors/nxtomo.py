@@ -281,6 +281,8 @@ def _write_entry(entry: h5py.Group, experiment: Experiment, series: Series) -> N
     import h5py
 
     entry.attrs["NX_class"] = "NXentry"
+    # of the layout, as the package nxtomo counts
+    entry.attrs["version"] = 2.0
     entry.attrs[COORDINATES] = "McStas"
     entry["definition"] = "NXtomo"
     entry["title"] = experiment.title
