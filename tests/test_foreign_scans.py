@@ -238,6 +238,14 @@ def test_wrong_nxtomo_files_are_answered_in_one_line(tmp_path, change, told):
     assert "\n" not in str(caught.value)
 
 
+def test_alignment_frames_are_no_radiographs(tmp_path):
+    """The package nxtomo marks them in a key of its own, and as radiographs in that of the definition."""
+    keys = np.array([2, 1, 1, *[0] * (foreign.VIEWS - 2), -1, -1, 3])
+    path = nexus(tmp_path, lambda e: e.__setitem__(f"{DETECTOR}/image_key_control", keys))
+    scan = read_scan(str(path))
+    assert scan.images.count == len(scan.angle_deg) == foreign.VIEWS - 2
+
+
 def test_one_of_several_entries_is_chosen_by_its_name(tmp_path):
     path = tmp_path / "both.nx"
     write_nxtomo(path, experiment())

@@ -103,13 +103,13 @@ def test_a_geometry_file_tells_distances_and_angles(laboratory, ending):
     (laboratory / "test" / "radiographs.csv").rename(laboratory / "table.csv")
     result = pdvc_bench(
         "import", "--reference", laboratory / "test", "--test", laboratory / "scan.nx", "-o", laboratory / "out",
-        "--geometry", path, "--pixel-mm", 0.5, "--period-s", 2, "--no-forces",
+        "--geometry", path, "--pixel-mm", 0.5, "--roll-deg", 2, "--period-s", 2, "--no-forces",
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr
     opened = read_experiment(laboratory / "out")
     assert opened.geometry.source_axis_mm == pytest.approx(31.0)
     assert opened.geometry.row_shift_mm == pytest.approx(0.4)
-    assert opened.geometry.roll_rad == pytest.approx(0.01)
+    assert np.rad2deg(opened.geometry.roll_rad) == pytest.approx(2)  # an option stands above the file
     np.testing.assert_allclose(opened.reference.angle_rad, angle, atol=1e-9)
     assert (opened.test.force_N == 0).all()
 

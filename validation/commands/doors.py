@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from validation.commands.parts import Options, Threads, answering, read_options, tell, use_threads
+from validation.commands.parts import Threads, answering, read_options, tell, use_threads
 
 
 class Series(StrEnum):
@@ -210,7 +210,12 @@ def export(
     nxtomo: Annotated[
         Path | None, typer.Option("--nxtomo", metavar="FILE", help="The experiment as NXtomo (HDF5), two entries.")
     ] = None,
-    options: Options = "default",
+    options: Annotated[
+        str | None,
+        typer.Option(
+            "--options", metavar="NAME|TOML", help="For outline and volume; else the measurement's, or default."
+        ),
+    ] = None,
     work: Annotated[
         Path | None,
         typer.Option("--work", metavar="DIR", help="Where measure or prepare kept a volume, to be taken from there."),
@@ -235,7 +240,7 @@ def export(
             geometry=geometry,
             series=series.value,
             nxtomo=nxtomo,
-            options=read_options(options),
+            options=None if options is None else read_options(options),
             work=work,
         ).write(source, experiment, progress=progress)
     for path in written:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,8 +43,8 @@ class Export:
     series: str = "reference"
     """Whose angles the geometry is of: reference, test."""
     nxtomo: Path | None = None
-    options: MeasureOptions = DEFAULT
-    """For what is made of an experiment: outline and volume."""
+    options: MeasureOptions | None = None
+    """For what is made of an experiment, outline and volume; None: those of the measurement, or the default ones."""
     work: Path | None = None
     """Where these may be kept already, and are kept."""
 
@@ -70,7 +71,8 @@ class Export:
         opened = None if folder is None else read_experiment(folder)
         setup = None
         if opened is not None and (self.vtk is not None or self.volume is not None):
-            setup = set_up(opened, self.options, work=self.work, progress=progress)
+            chosen = self.options or (DEFAULT if measurement is None else _options_of(measurement, source))
+            setup = set_up(opened, chosen, work=self.work, progress=progress)
         written: list[Path] = []
         if measurement is not None:
             written += self._of_measurement(measurement, setup, progress)
@@ -105,3 +107,8 @@ class Export:
         if self.nxtomo is not None:
             write_nxtomo(self.nxtomo, experiment)
             yield self.nxtomo
+
+
+def _options_of(measurement: Measurement, source: Path) -> MeasureOptions:
+    """Return the options by which a measurement was made."""
+    return MeasureOptions.parse(tomllib.loads(measurement.provenance.options), where=f"{source}: options")

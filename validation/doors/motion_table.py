@@ -60,28 +60,29 @@ def _steps(measurement: Measurement, points_mm: Floats, gauge_mm: float) -> Iter
             motion = motion_of(measurement, step)
             if motion is None:
                 continue
-            lower, points, upper = points_mm - half, points_mm, points_mm + half
+            lower, current, upper = points_mm - half, points_mm, points_mm + half
+            rest = current - motion.displacement(current)
             if coordinates == MATERIAL:
-                lower, points, upper = (motion.current(each) for each in (lower, points, upper))
+                rest = points_mm
+                lower, current, upper = (motion.current(each) for each in (lower, current, upper))
             yield {
-                "coordinates": np.full(len(points), coordinates),
-                "step": np.full(len(points), step),
-                "point": np.arange(len(points)),
-                "time_s": np.full(len(points), recording.time_s[step]),
-                "force_N": np.full(len(points), recording.force_N[step]),
-                "angle_deg": np.full(len(points), np.rad2deg(recording.angle_rad[step])),
-                **_of_points(motion, lower, points, upper),
+                "coordinates": np.full(len(points_mm), coordinates),
+                "step": np.full(len(points_mm), step),
+                "point": np.arange(len(points_mm)),
+                "time_s": np.full(len(points_mm), recording.time_s[step]),
+                "force_N": np.full(len(points_mm), recording.force_N[step]),
+                "angle_deg": np.full(len(points_mm), np.rad2deg(recording.angle_rad[step])),
+                **_of_points(motion, rest, current, (lower, upper)),
             }
 
 
-def _of_points(motion: Motion, lower: Floats, current: Floats, upper: Floats) -> Columns:
-    """Return what is told of points, and of gauges about them, by their current places (point, 3)."""
+def _of_points(motion: Motion, rest: Floats, current: Floats, ends: tuple[Floats, Floats]) -> Columns:
+    """Return what is told of points, at rest and now, and of gauges about them, by their current ends (point, 3)."""
     seen = motion.observed(current)
     u = np.where(seen[:, None], motion.displacement(current), np.nan)
     deviation = np.where(seen[:, None], motion.deviation(current), np.nan)
-    strain, of_strain = motion.strain(lower, upper)
-    between = motion.observed(lower) & motion.observed(upper)
-    rest = current - motion.displacement(current)
+    strain, of_strain = motion.strain(*ends)
+    between = motion.observed(ends[0]) & motion.observed(ends[1])
     return {
         **{f"rest_{axis}_mm": rest[:, k] for k, axis in enumerate("xyz")},
         **{f"{axis}_mm": current[:, k] for k, axis in enumerate("xyz")},
