@@ -20,6 +20,7 @@ from tests.laws import law
 from tests.radiograph_files import random_counts
 from tests.synthetic_experiments import experiment
 from validation.doors.formats import read_scan
+from validation.doors.geometry_files import read_geometry, write_geometry
 from validation.doors.nxtomo import read_nxtomo, write_nxtomo
 from validation.doors.refusal import FormatError
 
@@ -201,7 +202,7 @@ DETECTOR = "instrument/detector"
         (lambda e: replaced(e, f"{DETECTOR}/data", np.ones((16, 4, 3))), r"whole counts .*found float64 of shape"),
         (
             lambda e: replaced(e, "sample/rotation_angle", np.zeros(3)),
-            r"16 numbers, one for each frame, found an array",
+            "16 numbers, one for each frame, found",
         ),
         (
             lambda e: replaced(e, f"{DETECTOR}/x_pixel_size", 0.5),
@@ -383,6 +384,62 @@ def test_text_is_no_hdf5(tmp_path):
     (tmp_path / "scan.h5").write_text("no HDF5 at all")
     with pytest.raises(FormatError, match=r"scan.h5: expected an NXtomo file, HDF5, found .*signature"):
         read_scan(str(tmp_path / "scan.h5"))
+
+
+@pytest.fixture(scope="module")
+def whole_files(tmp_path_factory):
+    """One file of each format, with all that belongs to it."""
+    folder = tmp_path_factory.mktemp("whole")
+    for name in ("nikon", "star", "single"):
+        (folder / name).mkdir()
+    geometry = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=4, columns=3)
+    for name in ("geometry.xml", "geometry.csv"):
+        write_geometry(folder / name, geometry, np.array([0.1, 0.2]))
+    foreign.write_single_tiffs(folder / "single")
+    return [
+        (foreign.write_nikon(folder / "nikon").path, read_scan),
+        (foreign.write_north_star(folder / "star").path, read_scan),
+        (folder / "single" / "radiographs.csv", read_scan),
+        (folder / "single" / "r0.tif", read_scan),
+        (folder / "geometry.xml", read_geometry),
+        (folder / "geometry.csv", read_geometry),
+    ]
+
+
+@law(120)
+@given(data=st.data())
+def test_whatever_is_in_a_file_the_answer_is_a_scan_or_one_line(whole_files, data):
+    """A part of a good file is left out, or other bytes stand in its place."""
+    path, read = data.draw(st.sampled_from(whole_files))
+    content = path.read_bytes()
+    start, length = data.draw(st.integers(0, len(content))), data.draw(st.integers(0, 60))
+    odd = st.sampled_from([b"", b"nan", b"-1", b"1e400", b"<", b"\n"])
+    other = data.draw(st.one_of(odd, st.binary(max_size=20)))
+    changed = path.with_name(f"changed{path.suffix}")
+    changed.write_bytes(content[:start] + other + content[start + length :])
+    told = "a file: expected a scan"
+    try:
+        found = read(changed if read is read_geometry else str(changed))
+        if read is read_scan:
+            found.images.read(0)
+    except FormatError as error:
+        told = str(error)
+    finally:
+        changed.unlink()
+    assert "\n" not in told
+    assert ": expected " in told
+
+
+@law(15)
+@given(share=st.floats(0, 0.999))
+def test_a_cut_nxtomo_file_is_answered_in_one_line(share):
+    with tempfile.TemporaryDirectory() as name:
+        path = foreign.write_nexus(Path(name) / "scan.nx").path
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(FormatError, match="expected an NXtomo file, HDF5, found") as caught:
+            read_scan(str(path))
+        assert "\n" not in str(caught.value)
 
 
 def test_single_tiffs_without_a_table_come_in_the_order_of_their_numbers(tmp_path):

@@ -144,9 +144,7 @@ class _Entry:
 
     def _angles(self, frames: int) -> tuple[Floats, tuple[str, ...]]:
         dataset = self._dataset(ANGLES)
-        values = np.atleast_1d(np.asarray(dataset[()], dtype=float))
-        if values.shape != (frames,):
-            raise self._refused(ANGLES, f"{frames} numbers, one for each frame", f"an array of shape {values.shape}")
+        values = self._of_frames(dataset, ANGLES, frames)
         if "units" not in dataset.attrs:
             return values, (f"{self._path}: {self._place}/{ANGLES}: no units: taken as degrees",)
         return values * self._factor(dataset, ANGLE, ANGLES), ()
@@ -155,9 +153,14 @@ class _Entry:
         if place not in self._group:
             return None
         dataset = self._dataset(place)
-        if dataset.shape != (frames,):
-            raise self._refused(place, f"{frames} numbers, one for each frame", f"an array of shape {dataset.shape}")
-        return np.asarray(np.asarray(dataset[()], dtype=float)[which] * self._factor(dataset, units, place))
+        return np.asarray(self._of_frames(dataset, place, frames)[which] * self._factor(dataset, units, place))
+
+    def _of_frames(self, dataset: h5py.Dataset, place: str, frames: int) -> Floats:
+        """Return one number for each frame."""
+        if dataset.shape != (frames,) or not np.issubdtype(dataset.dtype, np.number):
+            found = f"{dataset.dtype} of shape {dataset.shape}"
+            raise self._refused(place, f"{frames} numbers, one for each frame", found)
+        return np.asarray(dataset[()], dtype=float)
 
     def _geometry(self, size: tuple[int, int], given: Mapping[str, float]) -> dict[str, float]:
         """Return what the entry tells, of stored images; a key that it does not tell is left out."""

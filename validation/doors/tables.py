@@ -92,7 +92,10 @@ def read_table(path: Path) -> TextTable:
     if not lines:
         raise refused(path, "line 1", "names of columns", "an empty file")
     apart = max(",;\t", key=lines[0].count)
-    rows = [[text.strip() for text in row] for row in csv.reader(lines, delimiter=apart, skipinitialspace=True)]
+    try:
+        rows = [[text.strip() for text in row] for row in csv.reader(lines, delimiter=apart, skipinitialspace=True)]
+    except csv.Error as error:
+        raise refused(path, "", "a table", error) from None
     headers, body = rows[0], [(line, row) for line, row in enumerate(rows[1:], 2) if any(row)]
     for line, row in body:
         if len(row) != len(headers):
