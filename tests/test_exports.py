@@ -144,6 +144,10 @@ class TestTheSurface:
             assert (of_cells["strain_deviation"][known] > 0).all()
             assert cells.max() == len(points) - 1
 
+    def test_is_a_round_bar_as_thick_as_the_section_is_from_corner_to_corner(self, stretched):
+        points = surface_of(stretched).points_mm
+        np.testing.assert_allclose(np.hypot(points[..., 0], points[..., 1]), 2 * stretched.motion.basis.radius_mm)
+
     def test_is_closed_around_and_seen_from_outside(self, stretched):
         surface = surface_of(stretched)
         points, cells = surface.flat_mm, surface.quads()

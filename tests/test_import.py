@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from validation.doors.geometry_files import write_geometry
 from validation.doors.nxtomo import write_nxtomo
 from validation.doors.refusal import FormatError
 
+PAGE = (Path(__file__).parents[1] / "docs" / "doors.md").read_text(encoding="utf-8")
 RECORD = "Time [s];Load [kN];Stroke [mm]\n-5,0;0,2;0\n5,0;0,3;0,1\n45,0;0,7;0,5\n"
 """As a testing machine in a country with decimal commas writes it."""
 
@@ -131,6 +135,34 @@ def test_both_entries_of_an_nxtomo_file_are_the_experiment_again(tmp_path):
     np.testing.assert_array_equal(opened.flats, written.flats)
     assert opened.geometry.column_shift_mm == pytest.approx(written.geometry.column_shift_mm)
     assert opened.geometry.roll_rad == pytest.approx(written.geometry.roll_rad)
+
+
+class TestThePage:
+    @pytest.fixture(autouse=True)
+    def files(self, tmp_path, monkeypatch):
+        """Lay out what the page begins with: a Nikon scan, single TIFFs, and a record."""
+        for name in ("scan", "during-the-test"):
+            (tmp_path / name).mkdir()
+        foreign.write_nikon(tmp_path / "scan")
+        foreign.write_single_tiffs(tmp_path / "during-the-test", forces=False)
+        (tmp_path / "machine.csv").write_text(RECORD)
+        monkeypatch.chdir(tmp_path)
+
+    def test_its_first_command_makes_an_experiment(self, tmp_path):
+        found = re.search(r"^pdvc-bench (import (?:.*\\\n)*.*)$", PAGE, re.MULTILINE)
+        result = pdvc_bench(*shlex.split(found[1].replace("\\\n", "")))
+        assert result.exit_code == 0, result.stderr
+        opened = read_experiment(tmp_path / "bar")
+        assert (opened.material, opened.photons_per_count) == ("cast iron", 40)
+        np.testing.assert_allclose(opened.test.time_s, 2.0 * np.arange(12))
+
+    def test_its_python_makes_the_same(self):
+        (block,) = [text for text in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "Request(" in text]
+        session: dict[str, object] = {}
+        exec(compile(block, "doors.md", "exec"), session)
+        found = session["experiment"]
+        assert found.geometry.source_axis_mm == foreign.TO_AXIS_MM
+        np.testing.assert_allclose(found.test.force_N[[0, 5]], [250, 350])
 
 
 def refused(*arguments):

@@ -75,7 +75,7 @@ class Motion:
 def motion_of(measurement: Measurement, step: int) -> Motion | None:
     """Return the motion of a step; None where it was not measured."""
     motion = measurement.motion
-    known = np.isfinite(motion.amplitude[step]).all(axis=1) & motion.observed
+    known = np.isfinite(motion.amplitude[step]).all(axis=1)
     if not known.any():
         return None
     height = motion.basis.height_mm
