@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import csv
-import sys
 from xml.etree import ElementTree
 
 import h5py
@@ -154,6 +153,9 @@ class TestTheSurface:
         corner = points[cells]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 3] - corner[:, 0])
         assert ((normal * corner.mean(axis=1))[:, :2].sum(axis=1) > 0).all()
+        lower, upper = surface.edges_mm()
+        np.testing.assert_allclose(lower, (corner[:, 0] + corner[:, 1]) / 2)
+        np.testing.assert_allclose(upper, (corner[:, 2] + corner[:, 3]) / 2)
         edges = np.sort(np.concatenate([cells[:, [k, (k + 1) % 4]] for k in range(4)]), axis=1)
         _, shared = np.unique(edges, axis=0, return_counts=True)
         assert (shared == 1).sum() == 2 * AROUND  # only top and bottom are open
@@ -244,11 +246,6 @@ class TestTheTable:
                 expected = [None if value != value else value for value in values.tolist()]
                 assert packed[name] == expected
                 assert [float(value) if value else None for value in read] == expected
-
-    def test_names_the_extra_that_is_missing(self, stretched, tmp_path, monkeypatch):
-        monkeypatch.setitem(sys.modules, "pyarrow", None)
-        with pytest.raises(ImportError, match=r"pyarrow: expected to be installed.*pdvc-bench\[parquet\]"):
-            write_parquet(tmp_path / "motion.parquet", {})
 
 
 def test_a_volume_has_its_voxel_size_where_imagej_looks(tmp_path):

@@ -15,7 +15,14 @@ from pdvc.preparation import reference_volume
 from pdvc.progress import Progress, silent
 from pdvc.setup import Setup, set_up
 from validation.doors.geometry_files import write_geometry
-from validation.doors.motion_table import default_points, motion_table, read_points, write_csv, write_parquet
+from validation.doors.motion_table import (
+    check_parquet,
+    default_points,
+    motion_table,
+    read_points,
+    write_csv,
+    write_parquet,
+)
 from validation.doors.nxtomo import write_nxtomo
 from validation.doors.paraview import write_series
 from validation.doors.refusal import FormatError, refused
@@ -57,6 +64,8 @@ class Export:
         if not asked:
             options = ", ".join(f"--{name}" for name in (*OF_MEASUREMENT, *OF_EXPERIMENT))
             raise FormatError(f"export: expected at least one of {options}, found none")
+        if self.parquet is not None:
+            check_parquet()
         if self.gauge_mm is not None and not self.gauge_mm > 0:
             raise refused("--gauge-mm", "", "a length above 0 mm", self.gauge_mm)
         if source.is_dir() and experiment is not None:

@@ -100,11 +100,15 @@ def write_csv(path: Path, columns: Columns) -> None:
     write_whole(path, "\n".join([",".join(columns), *rows, ""]).encode())
 
 
-def write_parquet(path: Path, columns: Columns) -> None:
-    """Write a table as Parquet, NaN as null; raises ImportError that names the extra where pyarrow is not there."""
+def check_parquet() -> None:
+    """Raise ImportError, naming the extra, where what Parquet needs is not installed."""
     from pdvc_bench import check_extra
 
     check_extra("parquet", "pyarrow")
+
+
+def write_parquet(path: Path, columns: Columns) -> None:
+    """Write a table as Parquet, NaN as null; `check_parquet` first tells whether it can be."""
     import pyarrow as pa
     from pyarrow import parquet
 
