@@ -1,8 +1,8 @@
 """Files of other programs against these programs themselves: python -m benchmarks.doors
 
 Each check needs a package that this project does not: nxtomo, axitom (whose package holds one radiograph of a tensile
-specimen from a Nikon scanner), mbirjax, itk-rtk and vtk, all on PyPI under licences that permit it. One that is not
-installed is left out, and named. With all of them two minutes, most of it for RTK to load.
+specimen from a Nikon scanner), mbirjax, itk-rtk, astra-toolbox and vtk, all on PyPI. One that is not installed is
+left out, and named. With all of them two minutes, most of it for RTK to load.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from tests import foreign_scans as foreign
 from tests import synthetic_records as records
 from tests.synthetic_experiments import experiment
 from tests.test_geometry_files import ANGLES, SCANNER
+from validation.doors.astra import cone_vec
 from validation.doors.formats import read_scan
 from validation.doors.geometry_files import read_geometry, write_geometry
 from validation.doors.nxtomo import write_nxtomo
@@ -172,6 +174,25 @@ def rtk_reads(folder: Path) -> str:
     return f"matrices within {off:.0e}; written by RTK and read here: {back:.0e} mm, {turned:.0e} degrees"
 
 
+def astra_means(_: Path) -> str:
+    """Let ASTRA turn its geometry ``cone`` into vectors, which needs no GPU: its rows go up, so that v is reversed."""
+    import astra
+
+    right_px, down_px = 4.5, -7.25
+    geometry = replace(
+        SCANNER, column_shift_mm=right_px * SCANNER.pixel_mm, row_shift_mm=down_px * SCANNER.pixel_mm, roll_rad=0.0
+    )
+    # at ASTRA's angle its source is at (sin, -cos), ours at (-cos, sin)
+    angle = np.arctan2(-np.cos(ANGLES), -np.sin(ANGLES))
+    behind = geometry.source_detector_mm - geometry.source_axis_mm
+    pitch = (geometry.pixel_mm, geometry.pixel_mm)
+    size = (geometry.rows, geometry.columns)
+    cone = astra.create_proj_geom("cone", *pitch, *size, angle, geometry.source_axis_mm, behind)
+    vectors = astra.geom_postalignment(astra.geom_2vec(cone), (right_px, -down_px))["Vectors"]
+    vectors[:, 9:] *= -1
+    return f"vectors within {np.abs(vectors - cone_vec(geometry, ANGLES)).max():.0e} mm"
+
+
 def vtk_reads(folder: Path) -> str:
     """Let VTK read the grids that are written here."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -200,6 +221,7 @@ CHECKS: dict[str, tuple[str, str, Callable[[Path], str]]] = {
     "Nikon, read here": ("axitom", "axitom", axitom_holds),
     "North Star, read here": ("mbirjax", "mbirjax", mbirjax_reads),
     "RTK's geometry, both ways": ("itk-rtk", "itk", rtk_reads),
+    "ASTRA's vectors": ("astra-toolbox", "astra", astra_means),
     "VTK, written here": ("vtk", "vtkmodules", vtk_reads),
 }
 """What is checked: the package by its name on PyPI, the module by which it is found, and how."""
