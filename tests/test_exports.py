@@ -184,6 +184,19 @@ class TestTheSurface:
         assert np.isfinite(points).all()
         assert 0.5 < of_points["observed"].mean() < 1
 
+    def test_has_no_numbers_about_a_section_between_that_was_not_observed(self, tmp_path):
+        """Nor on either side of it, up to the next one that was."""
+        measured = records.measurement(AMPLITUDE, unobserved=(4,))
+        write_series(measured, surface_of(measured), tmp_path)
+        points, _, of_points, _ = vtu(tmp_path / "motion_00000.vtu")
+        low, high = records.HEIGHT_MM[[3, 5]]
+        between = (points[:, 2] > low + 1e-6) & (points[:, 2] < high - 1e-6)
+        assert between.any()
+        assert np.isnan(of_points["displacement_mm"][between]).all()
+        z = points[:, 2]
+        beside = ((z < low - 1e-6) & (z > -3.9)) | ((z > high + 1e-6) & (z < 3.5))
+        assert np.isfinite(of_points["displacement_mm"][beside]).all()
+
     def test_needs_two_sections(self):
         measured = records.measurement(AMPLITUDE[:, :1])
         with pytest.raises(ValueError, match="surface: expected at least 2 observed sections, found 1"):

@@ -11,7 +11,7 @@ import typer
 from validation.commands.parts import Threads, answering, read_options, tell, use_threads
 
 
-class Series(StrEnum):
+class SeriesName(StrEnum):
     """The series of an experiment."""
 
     REFERENCE = "reference"
@@ -206,7 +206,7 @@ def export(
         Path | None,
         typer.Option("--geometry", metavar="FILE", help="The geometry: .xml for RTK, .csv for ASTRA (cone_vec)."),
     ] = None,
-    series: Annotated[Series, typer.Option("--series", help="Whose angles --geometry is of.")] = Series.REFERENCE,
+    series: Annotated[Series, typer.Option("--series", help="Whose angles --geometry is of.")] = SeriesName.REFERENCE,
     nxtomo: Annotated[
         Path | None, typer.Option("--nxtomo", metavar="FILE", help="The experiment as NXtomo (HDF5), two entries.")
     ] = None,

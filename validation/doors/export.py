@@ -60,23 +60,9 @@ class Export:
 
         Returns what was written. Raises ValueError, in one line, where what is asked for is not of what is given.
         """
-        asked = [name for name in (*OF_MEASUREMENT, *OF_EXPERIMENT) if getattr(self, name) is not None]
-        if not asked:
-            options = ", ".join(f"--{name}" for name in (*OF_MEASUREMENT, *OF_EXPERIMENT))
-            raise FormatError(f"export: expected at least one of {options}, found none")
-        if self.parquet is not None:
-            check_parquet()
-        if self.gauge_mm is not None and not self.gauge_mm > 0:
-            raise refused("--gauge-mm", "", "a length above 0 mm", self.gauge_mm)
-        if source.is_dir() and experiment is not None:
-            raise refused("--experiment", "", "a measurement before it", f"{source}, a folder")
+        self._check(source, experiment)
         folder = source if source.is_dir() else experiment
         measurement = None if source.is_dir() else read_measurement(source)
-        for name in asked:
-            if name in OF_MEASUREMENT and measurement is None:
-                raise refused(source, f"--{name}", "a measurement, as measure writes it", "an experiment folder")
-            if name in OF_EXPERIMENT and folder is None:
-                raise refused(source, f"--{name}", "an experiment: --experiment DIR", "a measurement alone")
         opened = None if folder is None else read_experiment(folder)
         setup = None
         if opened is not None and (self.vtk is not None or self.volume is not None):
@@ -88,6 +74,24 @@ class Export:
         if opened is not None:
             written += self._of_experiment(opened, setup, progress)
         return written
+
+    def _check(self, source: Path, experiment: Path | None) -> None:
+        """Raise ValueError, or ImportError, unless what is asked for can be made of what is given."""
+        asked = [name for name in (*OF_MEASUREMENT, *OF_EXPERIMENT) if getattr(self, name) is not None]
+        if not asked:
+            options = ", ".join(f"--{name}" for name in (*OF_MEASUREMENT, *OF_EXPERIMENT))
+            raise FormatError(f"export: expected at least one of {options}, found none")
+        if self.parquet is not None:
+            check_parquet()
+        if self.gauge_mm is not None and not self.gauge_mm > 0:
+            raise refused("--gauge-mm", "", "a length above 0 mm", self.gauge_mm)
+        if source.is_dir() and experiment is not None:
+            raise refused("--experiment", "", "a measurement before it", f"{source}, a folder")
+        for name in asked:
+            if name in OF_MEASUREMENT and source.is_dir():
+                raise refused(source, f"--{name}", "a measurement, as measure writes it", "an experiment folder")
+            if name in OF_EXPERIMENT and not source.is_dir() and experiment is None:
+                raise refused(source, f"--{name}", "an experiment: --experiment DIR", "a measurement alone")
 
     def _of_measurement(self, measurement: Measurement, setup: Setup | None, progress: Progress) -> Iterator[Path]:
         if self.vtk is not None:

@@ -28,7 +28,7 @@ class Motion:
     amplitude: Floats
     """(section, motion), voxels; sections that were not observed move as their neighbours do."""
     observed_mm: tuple[float, float]
-    """Heights between which the motion was observed."""
+    """Heights of the lowest and the highest section that was observed."""
 
     def displacement(self, current_mm: Floats) -> Floats:
         """Return u (point, 3), mm, at current positions (point, 3), mm."""
@@ -48,9 +48,10 @@ class Motion:
         raise ValueError(f"step {self.step}: expected a place for each material point, found that the motion folds")
 
     def observed(self, current_mm: Floats) -> NDArray[np.bool_]:
-        """Return which current positions (point,) lie between the lowest and the highest observed section."""
+        """Return at which current positions (point,) observed sections alone take part, the outermost not exceeded."""
         low, high = self.observed_mm
-        return np.asarray((current_mm[:, 2] >= low - CLOSE_MM) & (current_mm[:, 2] <= high + CLOSE_MM))
+        known = np.isfinite(self.measurement.motion.displacement(self.step, current_mm)).all(axis=1)
+        return np.asarray(known & (current_mm[:, 2] >= low - CLOSE_MM) & (current_mm[:, 2] <= high + CLOSE_MM))
 
     def deviation(self, current_mm: Floats) -> Floats:
         """Return the standard deviations of u (point, 3), mm, across the beam, vertical and along the beam."""
