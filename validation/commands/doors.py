@@ -206,7 +206,9 @@ def export(
         Path | None,
         typer.Option("--geometry", metavar="FILE", help="The geometry: .xml for RTK, .csv for ASTRA (cone_vec)."),
     ] = None,
-    series: Annotated[Series, typer.Option("--series", help="Whose angles --geometry is of.")] = SeriesName.REFERENCE,
+    series: Annotated[
+        SeriesName, typer.Option("--series", help="Whose angles --geometry is of.")
+    ] = SeriesName.REFERENCE,
     nxtomo: Annotated[
         Path | None, typer.Option("--nxtomo", metavar="FILE", help="The experiment as NXtomo (HDF5), two entries.")
     ] = None,
