@@ -64,11 +64,12 @@ def read_stack(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
         raise _unreadable(path, error) from None
 
 
-def read_radiograph(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
+def read_radiograph(path: Path, size: tuple[int, int], where: str = DESCRIPTION) -> NDArray[np.uint16]:
     """Return the counts (row, column) of a TIFF of one image, of a size (rows, columns) in px, into memory.
 
-    The file may still be written to. Raises UnfinishedError, in one line, unless all that it says is there, and
-    ExperimentError for one that is whole, but of several images, of other counts or of another size.
+    `where` tells, for errors, what has that size. The file may still be written to. Raises UnfinishedError, in one
+    line, unless all that it says is there, and ExperimentError for one that is whole, but of several images, of other
+    counts or of another size.
     """
     try:
         with tifffile.TiffFile(path) as tiff:
@@ -80,7 +81,7 @@ def read_radiograph(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
             _check_counts(path, page.dtype)
             found = tuple(page.shape) if len(tiff.pages) == 1 else (len(tiff.pages), *page.shape)
             if found != size:
-                raise ExperimentError(f"{path}: expected one image {size} as in {DESCRIPTION}, found {found}")
+                raise ExperimentError(f"{path}: expected one image {size} as in {where}, found {found}")
             return page.asarray()
     except ExperimentError:
         raise

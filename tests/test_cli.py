@@ -30,7 +30,7 @@ def motion(tmp_path_factory):
     "command",
     [
         *("scenarios", "options", "simulate", "measure", "score", "report", "run", "studies", "study", "compare"),
-        *("prepare", "live", "play", "page", "watch"),
+        *("prepare", "live", "play", "page", "watch", "import", "export"),
     ],
 )
 def test_every_command_explains_itself(command):

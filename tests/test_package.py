@@ -98,6 +98,9 @@ def test_a_laboratory_needs_no_extra_to_measure(tmp_path):
         ("measure", "experiment", "-o", "motion.nc", "--options", "options.toml"),
         ("report", "motion.nc", "--experiment", "experiment", "-o", "report"),
         ("plan", "experiment", "--options", "options.toml"),
+        ("export", "motion.nc", "--experiment", "experiment", "--vtk", "vtk", "--csv", "motion.csv"),
+        ("export", "experiment", "--nxtomo", "both.nx", "--geometry", "geometry.xml"),
+        ("import", "--reference", "both.nx::reference", "--test", "both.nx::test", "-o", "again"),
     ):
         done = run(*command)
         assert done.returncode == 0, done.stderr
@@ -112,6 +115,7 @@ def test_a_laboratory_needs_no_extra_to_measure(tmp_path):
         (("study", "noise", "-o", "out"), MANY, "many"),
         (("compare", "quick", "-o", "out"), MANY, "many"),
         (("page", "motion.nc"), LIVE, "live"),
+        (("export", "motion.nc", "--parquet", "out"), {"pyarrow"}, "parquet"),
     ],
 )
 def test_what_needs_an_extra_names_it_in_one_line(tmp_path, command, missing, extra):

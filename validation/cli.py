@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from validation.commands import live, many, one, watching
+from validation.commands import doors, live, many, one, watching
 from validation.commands.parts import Debugging
 
 app = typer.Typer(
@@ -41,8 +41,10 @@ for _command in (
     *(many.compare, many.studies, many.study, many.plan),
     *(live.prepare, live.live, live.play),
     *(watching.page, watching.watch),
+    doors.export,
 ):
     app.command()(_command)
+app.command("import")(doors.import_)
 
 
 if __name__ == "__main__":
