@@ -284,8 +284,7 @@ class LastFirst(Executor):
 
 
 def test_a_pile_has_the_same_bits_whichever_block_a_pool_begins_with():
-    shape, functions = (64, 7), np.random.default_rng(2).normal(size=(2, 3))
-    found = []
+    functions, found = np.random.default_rng(2).normal(size=(2, 3)), []
     for pool in (None, LastFirst()):
         rng = np.random.default_rng(3)
         pile = Pile(functions)
