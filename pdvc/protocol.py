@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pdvc.cells import Cells, Spot
 from pdvc.compilation import compile_kernels
 from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
-from pdvc.deviations import step_covariance, turned_std
+from pdvc.deviations import beam_frame, step_covariance
 from pdvc.equations import Equations, check_size, linearise, residuals
 from pdvc.experiment import Experiment
 from pdvc.history import settled
@@ -160,13 +160,18 @@ def _on_the_axis(
     covariance: Floats, basis: SectionBasis, observed: NDArray[np.bool_], time_functions: Floats, angle_rad: Floats
 ) -> tuple[float, float, float]:
     """Return the rms standard deviations of u on the axis, over steps and observed sections, in three directions."""
-    points = np.zeros((int(observed.sum()), 3))
-    points[:, 2] = basis.height_mm[observed]
-    found = [
-        turned_std(basis, step_covariance(covariance, time_functions, t), float(angle), points)
-        for t, angle in enumerate(angle_rad)
-    ]
-    across, vertical, along = np.sqrt((np.concatenate(found) ** 2).mean(axis=0)).tolist()
+    sections, motions = basis.shape
+    points = np.zeros((sections, 3))
+    points[:, 2] = basis.height_mm
+    own = np.arange(sections)
+    # at a section no other one takes part
+    shapes = basis.shapes(points)[own, :, own]
+    variances = []
+    for t, frame in enumerate(beam_frame(angle_rad)):
+        blocks = step_covariance(covariance, time_functions, t).reshape(sections, motions, sections, motions)
+        turned = frame @ shapes
+        variances.append(((turned @ blocks[own, :, own]) * turned).sum(axis=2)[observed])
+    across, vertical, along = np.sqrt(np.maximum(np.mean(variances, axis=(0, 1)), 0)).tolist()
     return across, vertical, along
 
 
