@@ -28,6 +28,8 @@ PARTS: dict[str, tuple[str, ...]] = {
     "turning-0.1": ("acquisition.exposure_samples", "acquisition.exposure_share"),
     "spot-size": ("scanner.focal_spot.size_mm",),
     "spot-drift": ("scanner.focal_spot.drift_mm", "scanner.focal_spot.drift_time_s"),
+    "beam-drift": ("scanner.open_beam.drift_per_hour",),
+    "current": ("scanner.open_beam.current_spread",),
     "open-beam": ("scanner.open_beam",),
     "scatter": ("scanner.scatter",),
     "panel-blur": ("detector.blur_px", "scanner.panel.scintillator_blur_px"),
@@ -39,6 +41,8 @@ PARTS: dict[str, tuple[str, ...]] = {
         f"scanner.panel.{key}"
         for key in ("zingers_per_cm2_min", "zinger_counts", "bad_clusters", "bad_cluster_px", "bad_columns")
     ),
+    "quick-lag": ("scanner.lag.share", "scanner.lag.time_s"),
+    "afterglow": ("scanner.lag.afterglow_share", "scanner.lag.afterglow_time_s"),
     "lag": ("scanner.lag",),
 }
 """Names of parts, and the keys that they take from `laboratory`."""
