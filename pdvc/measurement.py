@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.correction import Correction
 from pdvc.deviations import step_covariance, strain_std, turned_std
 from pdvc.sections import SectionBasis
 from pdvc.verdict import UNCHECKED, Stop, Verdict
@@ -174,6 +175,8 @@ class Measurement:
     provenance: Provenance = field(default_factory=Provenance)
     verdict: Verdict = UNCHECKED
     """What speaks against the measurement."""
+    correction: Correction | None = None
+    """What self-calibration found of the scanner, where it was asked for; the geometry was corrected by it."""
 
     def turned_std(self, step: int, points_mm: Floats) -> Floats:
         """Return the standard deviations (point, 3), voxels, across the beam, vertical and along the beam.

@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from pdvc.correction import correction_of, text_of
 from pdvc.deviations import BEAM
 from pdvc.measurement import (
     Fit,
@@ -110,6 +111,7 @@ def dataset_of(measurement: Measurement) -> xr.Dataset:
             **{f"seconds_{name}": value for name, value in m.provenance.seconds.items()},
             **{f"residual_{name}": value for name, value in _tests(m.fit.residual_tests).items()},
             "stages": len(m.fit.stages),
+            **({} if m.correction is None else {"self_calibration": text_of(m.correction)}),
         },
     )
     for n, stage in enumerate(m.fit.stages):
@@ -183,6 +185,7 @@ def _measurement_of(data: xr.Dataset) -> Measurement:
             },
         ),
         verdict=Verdict(doubts=tuple(doubts)),
+        correction=correction_of(str(attrs["self_calibration"])) if "self_calibration" in attrs else None,
     )
 
 

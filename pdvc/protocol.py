@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.compilation import compile_kernels
-from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
+from pdvc.correction import corrected
+from pdvc.data_checks import cleared, doubts_of_data, doubts_of_time, usable
 from pdvc.deviations import step_covariance, turned_std
 from pdvc.equations import Equations, check_size, linearise, residuals
 from pdvc.experiment import Experiment
@@ -61,7 +62,11 @@ def measure(
     examining = time.perf_counter() - examining
     with explained_by(doubts):
         found, volume = _measured(experiment, options, work, progress)
-    after = doubts_of_result(found, volume, experiment.geometry, options.prior_voxel)
+    geometry = experiment.geometry
+    if found.correction is not None:
+        geometry = corrected(geometry, found.correction.values_px)
+    doubts = cleared(doubts, found.correction)
+    after = doubts_of_result(found, volume, geometry, options.prior_voxel)
     verdict = Verdict(doubts=(*doubts, *after))
     with explained_by(verdict.doubts):
         check_finite(found)
@@ -145,6 +150,7 @@ def _measured(
             options=setup.options.template(),
             versions=versions(),
         ),
+        correction=setup.correction,
     )
     return measurement, fine.images.volume
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.beam_hardening import Outline, find_outline
+from pdvc.correction import Correction, corrected, correction_of, text_of, view_motion
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
 from pdvc.history import time_basis
@@ -19,6 +21,8 @@ from pdvc.prior import Prior
 from pdvc.progress import Progress, silent
 from pdvc.radiographs import IDENTITY, Calibration, binned, calibrate, grey_levels
 from pdvc.sections import RIGID, SectionBasis, SectionPattern
+from pdvc.seen_twice import seen_twice
+from pdvc.self_calibration import self_calibrated
 from pdvc.store import Keep, Store
 from pdvc.verdict import listed
 from pdvc.volume import Hull
@@ -38,6 +42,11 @@ class Setup:
     """An experiment made ready to be measured: what does not depend on the scale, nor on the motion."""
 
     experiment: Experiment
+    """With the geometry as it was told, or as self-calibration found it."""
+    told: ConeBeam
+    """The geometry as it was told, at scale 1."""
+    correction: Correction | None
+    """What self-calibration found, where it was asked for."""
     options: ResolvedOptions
     store: Store
     calibration: Calibration
@@ -55,6 +64,14 @@ class Setup:
     def geometry(self) -> ConeBeam:
         """Return the scanner's geometry at scale 1."""
         return self.experiment.geometry
+
+    @property
+    def view_motion_px(self) -> Floats | None:
+        """Return how each reference view moved (view, 3), px, as in `pdvc.correction`; None where none did."""
+        if self.correction is None:
+            return None
+        found = view_motion(self.correction.values_px, self.experiment.reference)
+        return found if found.any() else None
 
     def recording(self) -> Recording:
         """Return what was recorded, for the result."""
@@ -101,13 +118,19 @@ def set_up(
     `work` is a folder for intermediate results. Raises ValueError, in one line, where options and experiment do not
     fit each other, or no sample is found.
     """
+    told = experiment.geometry
+    check_discarded(options, told)
+    correction = _corrected(experiment, options, Store(work, experiment), progress)
+    if correction is not None:
+        experiment = replace(experiment, geometry=corrected(told, correction.values_px))
     geometry, store = experiment.geometry, Store(work, experiment)
-    check_discarded(options, geometry)
     calibration, outline = _calibrated(experiment, options, store, progress)
     window = used_window(geometry, outline.hull, options.discard_rows, options.discard_columns)
     rigid, sections = _bases(geometry, window, outline.hull, options)
     return Setup(
         experiment=experiment,
+        told=told,
+        correction=correction,
         options=resolved(options, experiment, window[0], window[2]),
         store=store,
         calibration=calibration,
@@ -116,6 +139,34 @@ def set_up(
         rigid=rigid,
         sections=sections,
     )
+
+
+def _corrected(experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress) -> Correction | None:
+    """Return what self-calibration finds, if it is asked for; kept for every test with the same reference scan."""
+    sought = options.self_calibration
+    if sought == "none":
+        return None
+
+    def found() -> dict[str, NDArray[Any]]:
+        # where the axis is by opposite views is a good first guess, and an outline needs it
+        twice = seen_twice(experiment.reference, experiment.geometry, calibrate(experiment))
+        axis_px = 0.0 if twice is None else twice.axis_px
+        guess = corrected(experiment.geometry, {"column_shift": -axis_px})
+        nearly = replace(experiment, geometry=guess)
+        calibration, outline = _calibrated(nearly, options, Store(None, nearly), progress)
+        correction = self_calibrated(
+            experiment.reference,
+            experiment.geometry,
+            calibration,
+            outline.hull,
+            sought,
+            axis_px=axis_px,
+            progress=progress,
+        )
+        return {"correction": np.array(text_of(correction))}
+
+    kept = store.of_reference("self-calibration", (sought, options.beam_hardening), found)
+    return correction_of(str(kept["correction"]))
 
 
 def _calibrated(
