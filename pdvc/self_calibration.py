@@ -109,9 +109,10 @@ def self_calibrated(
     before = _rms(fine.left(nothing))
     # the axis first: what else is seen is told the better
     start = coarse.settled({**nothing, "column_shift": -axis_px}, ["column_shift"], progress)
-    shares = coarse.shares(start.values, progress)
+    changes = coarse.changes(start.values, names, coarse.left(start.values), progress)
+    shares = coarse.shares(start.values, names, changes)
     seen = [name for name in names if shares[name] >= LEAST_SEEN]
-    found = coarse.settled(start.values, seen, progress)
+    found = coarse.settled(start.values, seen, progress, changes[[names.index(name) for name in seen]])
     told_apart = [name for name in seen if name in GEOMETRY or abs(found.values[name]) > TOLD * found.std[name]]
     std, rounds = found.std, start.rounds + found.rounds
     values = {name: value if name in told_apart else 0.0 for name, value in found.values.items()}
@@ -204,25 +205,24 @@ class _Scan:
             progress(f"self-calibration, scale {self._scale}", k + 1, len(names))
         return result
 
-    def shares(self, values: Mapping[str, float], progress: Progress) -> dict[str, float]:
+    def shares(self, values: Mapping[str, float], names: Sequence[str], changes: Image) -> dict[str, float]:
         """Return |J| / |G| of each parameter: what the volume cannot take up of what it does to the views."""
-        names, step = list(values), STEP_PX * self._scale
-        here = self.views(values)
-        changes = self.changes(values, names, self.left(values), progress)
+        step, here = STEP_PX * self._scale, self.views(values)
         direct = (_moved_flat(here, name, step, self._series, self._scale) - here for name in names)
         return {
             name: _rms(change) / max(_rms(by_itself[:, self._rows] / step), 1e-30)
             for name, change, by_itself in zip(names, changes, direct, strict=True)
         }
 
-    def settled(self, start: Mapping[str, float], names: Sequence[str], progress: Progress) -> _Settled:
-        """Return where Gauss-Newton steps from `start` end; only parameters of some names are changed."""
+    def settled(
+        self, start: Mapping[str, float], names: Sequence[str], progress: Progress, changes: Image | None = None
+    ) -> _Settled:
+        """Return where Gauss-Newton steps from `start` end, in some parameters; `changes` are J there, if known."""
         values, rounds, last = dict(start), 0, np.inf
         deviation = np.array([DEVIATION_PX["geometry" if name in GEOMETRY else "motion"] for name in names])
         e = self.left(values)
-        changes = np.empty(0, dtype=np.float32)
         while True:
-            if not changes.size or last > RENEWED_PX:
+            if changes is None or (rounds and last > RENEWED_PX):
                 changes = self.changes(values, names, e, progress)
             now = np.array([values[name] for name in names])
             change, std = _change(changes, e, now, deviation)
