@@ -81,6 +81,9 @@ class Recording:
     """(step,)"""
     window: tuple[int, int, int, int]
     """Used part of the detector at scale 1: row_from, row_to, column_from, column_to."""
+    brightness: Floats | None = None
+    """Beam of each radiograph over that of the flats, by the air beside the sample, and its standard deviation
+    (step, 2); None: not asked for, or no air seen."""
 
     @property
     def steps(self) -> int:

@@ -125,6 +125,8 @@ def dataset_of(measurement: Measurement) -> xr.Dataset:
         for key in _OF_A_STAGE:
             value = getattr(stage, key)
             data.attrs[f"{name}_{key}"] = str(value) if isinstance(value, Stop) else value
+    if m.recording.brightness is not None:
+        data["brightness"] = (("step", "value_and_std"), m.recording.brightness)
     sources = m.motion.std_by_source
     if sources:
         data = data.assign_coords(source=list(sources))
@@ -169,6 +171,7 @@ def _measurement_of(data: xr.Dataset) -> Measurement:
     return Measurement(
         recording=Recording(
             **{**_part(found, "recording"), "window": (row_from, row_to, column_from, column_to)},
+            brightness=data["brightness"].values if "brightness" in data else None,
         ),
         motion=MeasuredMotion(**_part(found, "motion"), basis=basis, std_by_source=_sources(data)),
         fit=Fit(

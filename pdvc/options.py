@@ -109,6 +109,8 @@ class MeasureOptions(Settings):
     """take from all images the detector's fixed pattern, where the flats' noise is known; before the last stage"""
     weighting: Literal["uniform", "noise"] = "uniform"
     """all pixels alike, as in the paper, or by the inverse of their noise"""
+    brightness: Literal["flats", "air"] = "flats"
+    """beam of each radiograph: that of the flats, or told by the air beside the sample, where any is seen"""
     self_calibration: Literal["none", "geometry", "motion"] = "none"
     """correct the geometry by the reference scan itself: not, axis and roll, or these and motion of its views"""
     prior_voxel: Annotated[float, Field(gt=0)] = 30.0

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.beam_hardening import Outline, find_outline
+from pdvc.brightness import air_pixels, brightness
 from pdvc.correction import Correction, corrected, correction_of, text_of, view_motion
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
@@ -34,6 +35,8 @@ Image = NDArray[np.float32]
 _OUTLINE_ROWS = 240
 """The outline is found on radiographs binned to about this many rows."""
 _OUTLINE_VIEWS = 150
+_AIR_VIEWS = 24
+"""Reference views in which air is looked for."""
 ROWS_OF_A_SECTION = 2
 
 
@@ -84,7 +87,17 @@ class Setup:
             time_s=test.time_s,
             force_N=test.force_N,
             window=self.window,
+            brightness=self._brightness(),
         )
+
+    def _brightness(self) -> Floats | None:
+        """Return the brightness of each radiograph of the test and its deviation (step, 2), if air tells it."""
+        calibration = self.calibration
+        air = calibration.air
+        if air is None:
+            return None
+        beam, dark = calibration.open_beam, calibration.dark
+        return np.array([brightness(counts - dark, beam, air) for counts in self.experiment.test.counts])
 
     def time_functions(self) -> Floats:
         """Return the orthonormal time functions (function, step) of the options.
@@ -173,11 +186,23 @@ def _calibrated(
     experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress
 ) -> tuple[Calibration, Outline]:
     calibration = calibrate(experiment)
+    if options.brightness == "air":
+        calibration = with_air(experiment, calibration)
     given = {"fit": None, "none": IDENTITY}.get(str(options.beam_hardening), options.beam_hardening)
     polynomial = given if isinstance(given, tuple) else None
     keep = partial(store.of_reference, "outline", (calibration, polynomial))
     outline = outlined(experiment.reference, experiment.geometry, calibration, polynomial, keep, progress)
     return calibration.with_polynomial(outline.polynomial), outline
+
+
+def with_air(experiment: Experiment, calibration: Calibration) -> Calibration:
+    """Return a calibration that knows where air is seen in every radiograph; the same where it is nowhere."""
+    series = experiment.reference
+    some = np.unique(np.linspace(0, len(series), min(_AIR_VIEWS, len(series)), endpoint=False).astype(int))
+    return replace(
+        calibration,
+        air=air_pixels((grey_levels(series.counts[i], calibration) for i in some), calibration.bad),
+    )
 
 
 def outlined(
