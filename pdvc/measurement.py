@@ -147,6 +147,8 @@ class Fit:
     """Residual fields (step, row, column) over the window, grey levels (air 0, largest attenuation 1)."""
     residual_rigid: NDArray[np.float32]
     residual_final: NDArray[np.float32]
+    outliers: NDArray[np.bool_] | None = None
+    """(step, row, column) pixels of the window that were left out, where it was asked for."""
     residual_tests: ResidualTests | None = None
     """Whether the final residual is the noise that was expected; None: not asked."""
 

@@ -125,6 +125,8 @@ def dataset_of(measurement: Measurement) -> xr.Dataset:
         for key in _OF_A_STAGE:
             value = getattr(stage, key)
             data.attrs[f"{name}_{key}"] = str(value) if isinstance(value, Stop) else value
+    if m.fit.outliers is not None:
+        data["outliers"] = (("step", "row", "column"), m.fit.outliers.astype(np.int8))
     if m.recording.brightness is not None:
         data["brightness"] = (("step", "value_and_std"), m.recording.brightness)
     sources = m.motion.std_by_source
@@ -178,6 +180,7 @@ def _measurement_of(data: xr.Dataset) -> Measurement:
             **_part(found, "fit"),
             stages=tuple(_stage(data, f"stage{n}") for n in range(int(attrs["stages"]))),
             residual_tests=_tests_of(attrs),
+            outliers=data["outliers"].values.astype(bool) if "outliers" in data else None,
         ),
         provenance=Provenance(
             **_part(found, "provenance"),

@@ -61,6 +61,11 @@ class Prepared:
     snr_noise_db: Floats
     noise_rms: float | None
 
+    def without_outliers(self, pixels: NDArray[np.bool_]) -> Prepared:
+        """Return the same with some pixels (step, row, column) of no weight."""
+        weight = np.where(pixels, np.float32(0), self.images.weight)
+        return replace(self, images=replace(self.images, weight=weight))
+
     def without(self, pattern: Image) -> Prepared:
         """Return the same without a pattern (row, column), grey levels, that all images have in common."""
         found = self.systematic

@@ -20,7 +20,7 @@ from validation.commands.parts import (
     judge,
     read_options,
     tell,
-    tell_correction,
+    tell_scanner,
     use_threads,
 )
 from validation.commands.watching import PageBeside
@@ -126,7 +126,7 @@ def live(
                 see=pictures.see,
                 idle_s=idle_s,
             )
-    tell_correction(found)
+    tell_scanner(found)
     tell(f"record: {record_of(out)}")
     tell(f"measurement: {out}")
     judge(found)

@@ -18,7 +18,7 @@ from validation.commands.parts import (
     judge,
     read_options,
     tell,
-    tell_correction,
+    tell_scanner,
     use_threads,
 )
 
@@ -142,7 +142,7 @@ def measure(
         use_threads(threads)
         found = measure_into(out, opened, chosen, work=work, progress=progress)
     tell(used(found))
-    tell_correction(found)
+    tell_scanner(found)
     tell(f"measurement: {out}")
     judge(found)
 
@@ -243,7 +243,7 @@ def run(
     for part in outcome.reused:
         tell(f"{part}: finished before, kept")
     Console().print(summary(outcome.scores))
-    tell_correction(outcome.measurement)
+    tell_scanner(outcome.measurement)
     tell(f"report: {outcome.report}")
     judge(outcome.measurement)
 

@@ -87,10 +87,22 @@ def read_options(name: str, self_calibrate: str | None = None) -> MeasureOptions
     return found.model_copy(update={"self_calibration": asked.self_calibration})
 
 
-def tell_correction(measurement: Measurement) -> None:
-    """Print on stderr what self-calibration found, line by line, where it was asked for."""
+def tell_scanner(measurement: Measurement) -> None:
+    """Print on stderr what was found of the scanner, and left out, where it was asked for."""
     for line in measurement.correction.lines if measurement.correction else ():
         tell(f"self-calibration: {line}")
+    beam = measurement.recording.brightness
+    if beam is not None:
+        tell(
+            f"brightness: {beam[:, 0].min():.4f} to {beam[:, 0].max():.4f} of the flats, "
+            f"+- {beam[:, 1].max():.4f} at most, told by air"
+        )
+    elif 'brightness = "air"' in measurement.provenance.options:
+        tell("brightness: no air is seen beside the sample, taken to be that of the flats")
+    outliers = measurement.fit.outliers
+    if outliers is not None:
+        of_step = outliers.sum(axis=(1, 2))
+        tell(f"outliers: {of_step.sum()} pixels of {(of_step > 0).sum()} radiographs left out")
 
 
 def use_threads(count: int | None) -> None:
