@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.cells import CRACK, LEAST_STEPS, Cells, Spot
-from pdvc.data_checks import AIR_DOUBT, EDGE_SEEN, SATURATED, clips
+from pdvc.data_checks import AIR_DOUBT, AIR_ERROR, EDGE_SEEN, SATURATED, clips
 from pdvc.deviations import beam_frame
 from pdvc.examination import StackLook, look_at, share_at_top
 from pdvc.geometry import within_half_turn
@@ -170,7 +170,8 @@ class Watch:
         """Give what is wrong with the counts of a radiograph."""
         edge, air, top, covered = self._edge, float(look.air[0]), float(look.at_top[0]), float(look.edge[0])
         if not abs(air - 1) <= AIR_DOUBT:
-            lost = not abs(air - 1) <= AIR_LOST
+            # where brightness is told by the air, a radiograph is lost where data of a whole test would be refused
+            lost = not abs(air - 1) <= (AIR_LOST if self._setup.calibration.air is None else AIR_ERROR)
             yield Alarm(
                 name="beam",
                 value=abs(air - 1),

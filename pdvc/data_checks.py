@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.correction import Correction
 from pdvc.examination import Examination, StackLook, examine, full_scale, with_angles
 from pdvc.experiment import DESCRIPTION, FLATS, REFERENCE, TEST, Experiment, ExperimentError, Series
 from pdvc.history import Ramp, TimeFunction
@@ -43,6 +44,7 @@ FAN_TOLERANCE = 0.15
 """What the fan angle may differ from the stated one, as a share, beyond five standard deviations."""
 AXIS_PX = 1.0
 """What the axis may be off, px."""
+_AXIS = "axis"
 PLANE_SHARE, PLANE_PX = 0.02, 3.0
 """What the plane of the source may be off: a share of the rows, or px where that is more."""
 ALIKE, ANOTHER = 0.1, 0.4
@@ -125,6 +127,11 @@ def doubts_of_data(found: Examination, experiment: Experiment) -> tuple[Doubt, .
         *_of_reference(found, experiment),
         *_of_angles(found, experiment),
     )
+
+
+def cleared(doubts: tuple[Doubt, ...], correction: Correction | None) -> tuple[Doubt, ...]:
+    """Return the doubts about a scanner as told that are left once a correction was found."""
+    return doubts if correction is None else tuple(doubt for doubt in doubts if doubt.name != _AXIS)
 
 
 def doubts_of_time(parts: tuple[TimeFunction, ...], series: Series) -> Iterator[Doubt]:
@@ -297,7 +304,7 @@ def _of_reference(found: Examination, experiment: Experiment) -> Iterator[Doubt]
         )
     if abs(twice.axis_px) > AXIS_PX:
         yield Doubt(
-            name="axis",
+            name=_AXIS,
             figure=f"the axis is seen {twice.axis_px:+.1f} px from the column where the geometry says it is",
             advice="correct column_shift_mm by "
             f"{-twice.axis_px * experiment.geometry.pixel_mm:+.4g} mm, or crop all stacks alike",

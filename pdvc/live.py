@@ -201,7 +201,7 @@ class _Follower:
         if gone or not arrived:
             found = f"that of step {listed(gone)} not any more" if gone else "none"
             raise ExperimentError(f"{self._radiographs}: expected the radiographs of the test, found {found}")
-        return replace(self._setup.experiment, test=series_of(arrived))
+        return replace(self._setup.experiment, geometry=self._setup.told, test=series_of(arrived))
 
     def _opened(self, done: Iterable[int]) -> Incoming:
         geometry = self._setup.geometry

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.correction import Correction
 from pdvc.deviations import step_covariance, strain_std, turned_std
 from pdvc.sections import SectionBasis
 from pdvc.verdict import UNCHECKED, Stop, Verdict
@@ -80,6 +81,9 @@ class Recording:
     """(step,)"""
     window: tuple[int, int, int, int]
     """Used part of the detector at scale 1: row_from, row_to, column_from, column_to."""
+    brightness: Floats | None = None
+    """Beam of each radiograph over that of the flats, by the air beside the sample, and its standard deviation
+    (step, 2); None: not asked for, or no air seen."""
 
     @property
     def steps(self) -> int:
@@ -143,6 +147,8 @@ class Fit:
     """Residual fields (step, row, column) over the window, grey levels (air 0, largest attenuation 1)."""
     residual_rigid: NDArray[np.float32]
     residual_final: NDArray[np.float32]
+    outliers: NDArray[np.bool_] | None = None
+    """(step, row, column) pixels of the window that were left out, where it was asked for."""
     residual_tests: ResidualTests | None = None
     """Whether the final residual is the noise that was expected; None: not asked."""
 
@@ -174,6 +180,8 @@ class Measurement:
     provenance: Provenance = field(default_factory=Provenance)
     verdict: Verdict = UNCHECKED
     """What speaks against the measurement."""
+    correction: Correction | None = None
+    """What self-calibration found of the scanner, where it was asked for; the geometry was corrected by it."""
 
     def turned_std(self, step: int, points_mm: Floats) -> Floats:
         """Return the standard deviations (point, 3), voxels, across the beam, vertical and along the beam.

@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from pdvc.correction import correction_of, text_of
 from pdvc.deviations import BEAM
 from pdvc.measurement import (
     Fit,
@@ -110,6 +111,7 @@ def dataset_of(measurement: Measurement) -> xr.Dataset:
             **{f"seconds_{name}": value for name, value in m.provenance.seconds.items()},
             **{f"residual_{name}": value for name, value in _tests(m.fit.residual_tests).items()},
             "stages": len(m.fit.stages),
+            **({} if m.correction is None else {"self_calibration": text_of(m.correction)}),
         },
     )
     for n, stage in enumerate(m.fit.stages):
@@ -123,6 +125,10 @@ def dataset_of(measurement: Measurement) -> xr.Dataset:
         for key in _OF_A_STAGE:
             value = getattr(stage, key)
             data.attrs[f"{name}_{key}"] = str(value) if isinstance(value, Stop) else value
+    if m.fit.outliers is not None:
+        data["outliers"] = (("step", "row", "column"), m.fit.outliers.astype(np.int8))
+    if m.recording.brightness is not None:
+        data["brightness"] = (("step", "value_and_std"), m.recording.brightness)
     sources = m.motion.std_by_source
     if sources:
         data = data.assign_coords(source=list(sources))
@@ -167,12 +173,14 @@ def _measurement_of(data: xr.Dataset) -> Measurement:
     return Measurement(
         recording=Recording(
             **{**_part(found, "recording"), "window": (row_from, row_to, column_from, column_to)},
+            brightness=data["brightness"].values if "brightness" in data else None,
         ),
         motion=MeasuredMotion(**_part(found, "motion"), basis=basis, std_by_source=_sources(data)),
         fit=Fit(
             **_part(found, "fit"),
             stages=tuple(_stage(data, f"stage{n}") for n in range(int(attrs["stages"]))),
             residual_tests=_tests_of(attrs),
+            outliers=data["outliers"].values.astype(bool) if "outliers" in data else None,
         ),
         provenance=Provenance(
             **_part(found, "provenance"),
@@ -183,6 +191,7 @@ def _measurement_of(data: xr.Dataset) -> Measurement:
             },
         ),
         verdict=Verdict(doubts=tuple(doubts)),
+        correction=correction_of(str(attrs["self_calibration"])) if "self_calibration" in attrs else None,
     )
 
 

@@ -109,6 +109,12 @@ class MeasureOptions(Settings):
     """take from all images the detector's fixed pattern, where the flats' noise is known; before the last stage"""
     weighting: Literal["uniform", "noise"] = "uniform"
     """all pixels alike, as in the paper, or by the inverse of their noise"""
+    brightness: Literal["flats", "air"] = "flats"
+    """beam of each radiograph: that of the flats, or told by the air beside the sample, where any is seen"""
+    self_calibration: Literal["none", "geometry", "motion"] = "none"
+    """correct the geometry by the reference scan itself: not, axis and roll, or these and motion of its views"""
+    outliers_over: Annotated[float, Field(ge=4, le=1e6)] | Literal["none"] = "none"
+    """residual over what is usual, from which a pixel is left out of a step; then the last stage is solved again"""
     prior_voxel: Annotated[float, Field(gt=0)] = 30.0
     """standard deviation of every amplitude before the data, voxels (rms over the steps)"""
 

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.correction import moved_back
 from pdvc.equations import Images
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
@@ -60,6 +61,11 @@ class Prepared:
     snr_noise_db: Floats
     noise_rms: float | None
 
+    def without_outliers(self, pixels: NDArray[np.bool_]) -> Prepared:
+        """Return the same with some pixels (step, row, column) of no weight."""
+        weight = np.where(pixels, np.float32(0), self.images.weight)
+        return replace(self, images=replace(self.images, weight=weight))
+
     def without(self, pattern: Image) -> Prepared:
         """Return the same without a pattern (row, column), grey levels, that all images have in common."""
         found = self.systematic
@@ -93,7 +99,7 @@ def at_rest(setup: Setup, scale: int, progress: Progress = silent, *, all_views:
     experiment, options = setup.experiment, setup.options
     geometry = experiment.geometry.binned(scale)
     part = tuple(edge // scale for edge in setup.window)
-    view = _viewer(experiment.reference, setup.calibration, scale, options.smooth_px)
+    view = _viewer(experiment.reference, setup.calibration, scale, options.smooth_px, setup.view_motion_px)
     volume = reference_volume(setup, scale, progress)
     systematic = _systematic(experiment.reference, geometry, part, view, volume, setup.sections.radius_mm, scale)
     if all_views:
@@ -114,7 +120,7 @@ def _of_all_views(setup: Setup, scale: int, systematic: Systematic, progress: Pr
             progress(f"views, scale {scale}", some.stop, len(left))
         return {"e": left}
 
-    depends = (setup.calibration, setup.outline.hull, scale, _care(setup))
+    depends = (setup.calibration, setup.outline.hull, scale, _care(setup), setup.view_motion_px)
     kept = setup.store.of_reference("left", depends, made)["e"]
     return replace(systematic, left=lambda i: kept[i].astype(np.float32), ready=nothing_ready)
 
@@ -176,9 +182,14 @@ def volume_choices(options: MeasureOptions, geometry: ConeBeam) -> tuple[tuple[i
     return tuple(sorted(scales, reverse=True)), options.beam_hardening, options.smooth_px, options.sharpen
 
 
-def _viewer(series: Series, calibration: Calibration, scale: int, smooth_px: float) -> Callable[[int], Image]:
+def _viewer(
+    series: Series, calibration: Calibration, scale: int, smooth_px: float, motion_px: Floats | None = None
+) -> Callable[[int], Image]:
+    """Return the function that gives a radiograph at a scale; `motion_px` (view, 3) is what each is moved back by."""
+
     def view(i: int) -> Image:
-        return coarsened(smoothed(grey_levels(series.counts[i], calibration), smooth_px), scale)
+        seen = smoothed(grey_levels(series.counts[i], calibration), smooth_px)
+        return coarsened(seen if motion_px is None else moved_back(seen, motion_px[i]), scale)
 
     return view
 
@@ -186,9 +197,11 @@ def _viewer(series: Series, calibration: Calibration, scale: int, smooth_px: flo
 def reference_volume(setup: Setup, scale: int, progress: Progress = silent) -> Volume:
     """Reconstruct the reference scan at a scale; every experiment with the same reference scan finds it kept."""
     calibration, hull, care = setup.calibration, setup.outline.hull, _care(setup)
-    keep = partial(setup.store.of_reference, "volume", (calibration, hull, scale, care))
+    depends = (calibration, hull, scale, care, setup.view_motion_px)
+    keep = partial(setup.store.of_reference, "volume", depends)
     series = setup.experiment.reference
-    return scan_volume(series, setup.geometry, calibration, hull, scale, care, keep, progress)
+    motion_px = setup.view_motion_px
+    return scan_volume(series, setup.geometry, calibration, hull, scale, care, keep, progress, motion_px)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,12 +227,15 @@ def scan_volume(
     care: Care,
     keep: Keep,
     progress: Progress,
+    motion_px: Floats | None = None,
 ) -> Volume:
     """Reconstruct a full scan at a scale, inside a hull; `geometry` is that of scale 1.
 
+    `motion_px` (view, 3) is what each view is moved back by, as in `pdvc.correction`.
+
     At scale n one of n / 2 views is used: for pixels n times as large they are twice as close as at scale 1.
     """
-    view, geometry = _viewer(series, calibration, scale, care.smooth_px), geometry.binned(scale)
+    view, geometry = _viewer(series, calibration, scale, care.smooth_px, motion_px), geometry.binned(scale)
     grid, chosen = scan_grid(geometry, hull), one_of(series.angle_rad, scale // 2)
 
     def seen(i: int) -> Image:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from pdvc.cells import Cells, Spot
 from pdvc.compilation import compile_kernels
-from pdvc.data_checks import doubts_of_data, doubts_of_time, usable
+from pdvc.correction import corrected
+from pdvc.data_checks import cleared, doubts_of_data, doubts_of_time, usable
 from pdvc.deviations import beam_frame, step_covariance
 from pdvc.equations import Equations, check_size, linearise, residuals
 from pdvc.experiment import Experiment
@@ -27,6 +28,7 @@ from pdvc.history import settled
 from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Stage
 from pdvc.noise import Noise, Propagated, known_from_residual, propagate
 from pdvc.options import DEFAULT, MeasureOptions, ResolvedStage, check_discarded
+from pdvc.outliers import ROUNDS, outliers, unchanged
 from pdvc.pattern import fixed_pattern
 from pdvc.preparation import Prepared, noise_of, prepare, snr_of, snr_reprojection
 from pdvc.progress import Progress, silent
@@ -62,7 +64,11 @@ def measure(
     examining = time.perf_counter() - examining
     with explained_by(doubts):
         found, volume, spots = _measured(experiment, options, work, progress)
-    after = doubts_of_result(found, volume, experiment.geometry, options.prior_voxel)
+    geometry = experiment.geometry
+    if found.correction is not None:
+        geometry = corrected(geometry, found.correction.values_px)
+    doubts = cleared(doubts, found.correction)
+    after = doubts_of_result(found, volume, geometry, options.prior_voxel)
     verdict = Verdict(doubts=(*doubts, *after, *doubts_of_spots(spots)))
     with explained_by(verdict.doubts):
         check_finite(found)
@@ -142,6 +148,7 @@ def _measured(
             residual_rigid=after_rigid,
             residual_final=residual,
             residual_tests=tests,
+            outliers=solver.outliers,
         ),
         provenance=Provenance(
             seconds={
@@ -152,6 +159,7 @@ def _measured(
             options=setup.options.template(),
             versions=versions(),
         ),
+        correction=setup.correction,
     )
     return measurement, fine.images.volume, spots
 
@@ -182,6 +190,8 @@ class _Protocol:
         self, setup: Setup, prepared: Mapping[int, Prepared], time_functions: Floats, progress: Progress
     ) -> None:
         self.stages: list[Stage] = []
+        self.outliers: NDArray[np.bool_] | None = None
+        """Pixels (step, row, column) that were left out, where it was asked for."""
         self.prepared = dict(prepared)
         """The images of each scale, as they are used now."""
         self._setup = setup
@@ -199,6 +209,27 @@ class _Protocol:
             if to_noise and stage is stages[-1]:
                 self._remove_pattern(basis, found)
             found = self._stage(name, basis, stage, found, to_noise)
+        limit = self._setup.options.outliers_over
+        if to_noise and limit != "none":
+            found = self._without_outliers(name, basis, stages[-1], found, limit)
+        return found
+
+    def _without_outliers(
+        self, name: str, basis: SectionBasis, stage: ResolvedStage, found: _Found, limit: float
+    ) -> _Found:
+        """Leave out outliers and solve the last stage again, until they stay."""
+        fine = self.prepared[1]
+        used = fine.images.weight > 0
+        left_out = np.zeros(fine.images.grey.shape, dtype=bool)
+        for _ in range(ROUNDS):
+            amplitude = np.einsum("ft,fjk->tjk", found.time_functions, found.coefficients)
+            pixels = outliers(self.equations_at(basis, amplitude).residual, limit) & used
+            if unchanged(pixels, left_out):
+                break
+            left_out, self._last = pixels, None
+            self.prepared[1] = fine.without_outliers(pixels)
+            found = self._stage(name, basis, stage, found, to_noise=True)
+        self.outliers = left_out
         return found
 
     def _stage(self, name: str, basis: SectionBasis, stage: ResolvedStage, before: _Found, to_noise: bool) -> _Found:

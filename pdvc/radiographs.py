@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from pdvc.brightness import brightness
 from pdvc.experiment import FLATS, Experiment, ExperimentError
 from pdvc.robust import OF_MEDIAN
 
@@ -25,6 +26,8 @@ Image = NDArray[np.float32]
 
 LEAST_CONTRAST = 1e-7
 """Grey levels: the smallest standard deviation that an SNR is taken of."""
+LEAST_BRIGHTNESS = 0.1
+"""Share of the open beam that a radiograph is corrected for, at most: below there is hardly any beam."""
 IDENTITY = (1.0, 0.0, 0.0)
 """The polynomial that leaves attenuation as it is."""
 
@@ -41,6 +44,9 @@ class Calibration:
     """(row, column) pixels that are not to be believed."""
     polynomial: tuple[float, float, float] = IDENTITY
     """c1, c2, c3: from attenuation to grey levels."""
+    air: NDArray[np.bool_] | None = None
+    """(row, column) pixels that see air in every radiograph, by which its brightness is told (`pdvc.brightness`);
+    None: the beam is taken to be that of the flats."""
 
     def with_polynomial(self, polynomial: tuple[float, float, float]) -> Calibration:
         """Return the calibration with another polynomial."""
@@ -54,7 +60,8 @@ class Calibration:
         if factor == 1:
             return self
         dark, beam, bad = (binned(image.astype(np.float32), factor) for image in (self.dark, self.open_beam, self.bad))
-        return replace(self, dark=dark, open_beam=beam, bad=np.asarray(bad > 0))
+        air = None if self.air is None else np.asarray(binned(self.air.astype(np.float32), factor) == 1)
+        return replace(self, dark=dark, open_beam=beam, bad=np.asarray(bad > 0), air=air)
 
 
 def calibrate(experiment: Experiment) -> Calibration:
@@ -87,11 +94,19 @@ def _stands_out(image: Floats) -> NDArray[np.bool_]:
 
 def grey_levels(counts: NDArray[np.uint16] | Image, calibration: Calibration) -> Image:
     """Turn one radiograph (row, column) of counts into grey levels; bad pixels take their neighbours' mean."""
-    signal = np.maximum(counts.astype(np.float32) - calibration.dark, np.float32(1))
-    attenuation = np.log(calibration.open_beam / signal)
+    _, attenuation = _attenuation(counts, calibration)
     c1, c2, c3 = (np.float32(c) for c in calibration.polynomial)
     grey = attenuation * (c1 + attenuation * (c2 + attenuation * c3))
-    return np.asarray(fill(grey, calibration.bad), dtype=np.float32)
+    return fill(np.asarray(grey, dtype=np.float32), calibration.bad)
+
+
+def _attenuation(counts: NDArray[np.uint16] | Image, calibration: Calibration) -> tuple[Image, Image]:
+    """Return the signal of a radiograph, counts without the dark, and its attenuation (row, column)."""
+    signal = np.maximum(counts.astype(np.float32) - calibration.dark, np.float32(1))
+    beam = calibration.open_beam
+    if calibration.air is not None:
+        beam = beam * np.float32(max(brightness(signal, beam, calibration.air)[0], LEAST_BRIGHTNESS))
+    return signal, np.asarray(np.log(beam / signal), dtype=np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,13 +136,14 @@ def detector_noise(experiment: Experiment) -> DetectorNoise | None:
 
 def grey_noise(counts: NDArray[np.uint16], calibration: Calibration, noise: DetectorNoise) -> tuple[Image, Image]:
     """Return the variance (row, column) of grey levels from the image's own noise, and the slope dg / dq."""
-    signal = np.maximum(counts.astype(np.float32) - calibration.dark, np.float32(1))
+    signal, attenuation = _attenuation(counts, calibration)
     c1, c2, c3 = calibration.polynomial
-    attenuation = np.log(calibration.open_beam / signal)
     slope = c1 + attenuation * (2 * c2 + 3 * c3 * attenuation)
     variance = slope**2 * noise.relative_variance(signal)
     # a dead pixel's counts tell neither: its neighbours' mean stands for both, as for its grey level
-    return fill(np.asarray(variance, dtype=np.float32), calibration.bad), fill(slope, calibration.bad)
+    return fill(np.asarray(variance, dtype=np.float32), calibration.bad), fill(
+        np.asarray(slope, dtype=np.float32), calibration.bad
+    )
 
 
 def fill(image: Image, bad: NDArray[np.bool_]) -> Image:

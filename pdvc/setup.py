@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.beam_hardening import Outline, find_outline
+from pdvc.brightness import air_pixels, brightness
+from pdvc.correction import Correction, corrected, correction_of, text_of, view_motion
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
 from pdvc.history import time_basis
@@ -19,6 +22,8 @@ from pdvc.prior import Prior
 from pdvc.progress import Progress, silent
 from pdvc.radiographs import IDENTITY, Calibration, binned, calibrate, grey_levels
 from pdvc.sections import RIGID, SectionBasis, SectionPattern
+from pdvc.seen_twice import seen_twice
+from pdvc.self_calibration import self_calibrated
 from pdvc.store import Keep, Store
 from pdvc.verdict import listed
 from pdvc.volume import Hull
@@ -30,6 +35,8 @@ Image = NDArray[np.float32]
 _OUTLINE_ROWS = 240
 """The outline is found on radiographs binned to about this many rows."""
 _OUTLINE_VIEWS = 150
+_AIR_VIEWS = 24
+"""Reference views in which air is looked for."""
 ROWS_OF_A_SECTION = 2
 
 
@@ -38,6 +45,11 @@ class Setup:
     """An experiment made ready to be measured: what does not depend on the scale, nor on the motion."""
 
     experiment: Experiment
+    """With the geometry as it was told, or as self-calibration found it."""
+    told: ConeBeam
+    """The geometry as it was told, at scale 1."""
+    correction: Correction | None
+    """What self-calibration found, where it was asked for."""
     options: ResolvedOptions
     store: Store
     calibration: Calibration
@@ -56,6 +68,14 @@ class Setup:
         """Return the scanner's geometry at scale 1."""
         return self.experiment.geometry
 
+    @property
+    def view_motion_px(self) -> Floats | None:
+        """Return how each reference view moved (view, 3), px, as in `pdvc.correction`; None where none did."""
+        if self.correction is None:
+            return None
+        found = view_motion(self.correction.values_px, self.experiment.reference)
+        return found if found.any() else None
+
     def recording(self) -> Recording:
         """Return what was recorded, for the result."""
         test = self.experiment.test
@@ -67,7 +87,17 @@ class Setup:
             time_s=test.time_s,
             force_N=test.force_N,
             window=self.window,
+            brightness=self._brightness(),
         )
+
+    def _brightness(self) -> Floats | None:
+        """Return the brightness of each radiograph of the test and its deviation (step, 2), if air tells it."""
+        calibration = self.calibration
+        air = calibration.air
+        if air is None:
+            return None
+        beam, dark = calibration.open_beam, calibration.dark
+        return np.array([brightness(counts - dark, beam, air) for counts in self.experiment.test.counts])
 
     def time_functions(self) -> Floats:
         """Return the orthonormal time functions (function, step) of the options.
@@ -101,13 +131,19 @@ def set_up(
     `work` is a folder for intermediate results. Raises ValueError, in one line, where options and experiment do not
     fit each other, or no sample is found.
     """
+    told = experiment.geometry
+    check_discarded(options, told)
+    correction = _corrected(experiment, options, Store(work, experiment), progress)
+    if correction is not None:
+        experiment = replace(experiment, geometry=corrected(told, correction.values_px))
     geometry, store = experiment.geometry, Store(work, experiment)
-    check_discarded(options, geometry)
     calibration, outline = _calibrated(experiment, options, store, progress)
     window = used_window(geometry, outline.hull, options.discard_rows, options.discard_columns)
     rigid, sections = _bases(geometry, window, outline.hull, options)
     return Setup(
         experiment=experiment,
+        told=told,
+        correction=correction,
         options=resolved(options, experiment, window[0], window[2]),
         store=store,
         calibration=calibration,
@@ -118,15 +154,55 @@ def set_up(
     )
 
 
+def _corrected(experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress) -> Correction | None:
+    """Return what self-calibration finds, if it is asked for; kept for every test with the same reference scan."""
+    sought = options.self_calibration
+    if sought == "none":
+        return None
+
+    def found() -> dict[str, NDArray[Any]]:
+        # where the axis is by opposite views is a good first guess, and an outline needs it
+        twice = seen_twice(experiment.reference, experiment.geometry, calibrate(experiment))
+        axis_px = 0.0 if twice is None else twice.axis_px
+        guess = corrected(experiment.geometry, {"column_shift": -axis_px})
+        nearly = replace(experiment, geometry=guess)
+        calibration, outline = _calibrated(nearly, options, Store(None, nearly), progress)
+        correction = self_calibrated(
+            experiment.reference,
+            experiment.geometry,
+            calibration,
+            outline.hull,
+            sought,
+            axis_px=axis_px,
+            progress=progress,
+        )
+        return {"correction": np.array(text_of(correction))}
+
+    kept = store.of_reference("self-calibration", (sought, options.beam_hardening), found)
+    return correction_of(str(kept["correction"]))
+
+
 def _calibrated(
     experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress
 ) -> tuple[Calibration, Outline]:
     calibration = calibrate(experiment)
+    if options.brightness == "air":
+        calibration = with_air(experiment, calibration)
     given = {"fit": None, "none": IDENTITY}.get(str(options.beam_hardening), options.beam_hardening)
     polynomial = given if isinstance(given, tuple) else None
     keep = partial(store.of_reference, "outline", (calibration, polynomial))
     outline = outlined(experiment.reference, experiment.geometry, calibration, polynomial, keep, progress)
     return calibration.with_polynomial(outline.polynomial), outline
+
+
+def with_air(experiment: Experiment, calibration: Calibration) -> Calibration:
+    """Return a calibration that knows where air is seen in every radiograph; the same where it is nowhere."""
+    series = experiment.reference
+    some = np.unique(np.linspace(0, len(series), min(_AIR_VIEWS, len(series)), endpoint=False).astype(int))
+    return replace(
+        calibration,
+        air=air_pixels((grey_levels(series.counts[i], calibration) for i in some), calibration.bad),
+    )
 
 
 def outlined(

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from pdvc import gauss_newton
 from pdvc.compilation import compile_comparison, compile_kernels
-from pdvc.data_checks import doubts_of_reference, usable
+from pdvc.data_checks import cleared, doubts_of_reference, usable
 from pdvc.equations import Equations
 from pdvc.experiment import Experiment, InterruptedScan
 from pdvc.history import Steps, time_basis
@@ -145,8 +145,10 @@ def correlate(
             options=setup.options.template(),
             versions=versions(),
         ),
+        correction=setup.correction,
     )
-    doubts = (*doubts_of_reference(examined, experiment), *doubts_of_solution(measured, options.prior_voxel))
+    before = cleared(doubts_of_reference(examined, experiment), setup.correction)
+    doubts = (*before, *doubts_of_solution(measured, options.prior_voxel))
     return replace(measured, verdict=Verdict(doubts=doubts))
 
 

@@ -6,7 +6,10 @@ from sphinx.application import Sphinx
 
 NAVIGATION = {
     "Start": ["start", "scenarios", "scanner", "examples"],
-    "How to": ["own-radiographs", "doors", "live", "walkthrough", "studies", "methods", "extend", "strategies"],
+    "How to": [
+        *("own-radiographs", "calibration", "doors", "live", "walkthrough", "studies", "methods", "extend"),
+        "strategies",
+    ],
     "Explanation": [
         "equations",
         "protocol",

@@ -13,12 +13,14 @@ import typer
 from validation.commands.parts import (
     ExperimentFolder,
     Options,
+    SelfCalibrate,
     Threads,
     answering,
     check_folder,
     judge,
     read_options,
     tell,
+    tell_scanner,
     use_threads,
 )
 from validation.commands.watching import PageBeside
@@ -28,6 +30,7 @@ def prepare(
     experiment: ExperimentFolder,
     work: Annotated[Path, typer.Option("--work", metavar="DIR", help="Where what is prepared is kept.")],
     options: Options = "default",
+    self_calibrate: SelfCalibrate = None,
     threads: Threads = None,
 ) -> None:
     """Prepare a test that is to be followed while it runs, as soon as its reference scan is done.
@@ -41,7 +44,7 @@ def prepare(
         from pdvc.experiment import read_experiment
         from pdvc.live import make_ready
 
-        chosen = read_options(options)
+        chosen = read_options(options, self_calibrate)
         use_threads(threads)
         check_folder("--work", work)
         make_ready(read_experiment(experiment, planned=True), chosen, work=work, progress=progress)
@@ -69,6 +72,7 @@ def live(
     page: Annotated[
         bool, typer.Option("--page", help="Show the test on a page, as the command page does, until it is over.")
     ] = False,
+    self_calibrate: SelfCalibrate = None,
     threads: Threads = None,
 ) -> None:
     """Follow a test while it runs: the motion of each radiograph, with its interval, as soon as it has come.
@@ -101,7 +105,7 @@ def live(
                 print(line.words(), flush=True)
             pictures.tell(line)
 
-        chosen, planned = read_options(options), read_experiment(experiment, planned=True)
+        chosen, planned = read_options(options, self_calibrate), read_experiment(experiment, planned=True)
         use_threads(threads)
         # what would be told in the end, hours later, or once all is prepared
         if out.is_dir():
@@ -122,6 +126,7 @@ def live(
                 see=pictures.see,
                 idle_s=idle_s,
             )
+    tell_scanner(found)
     tell(f"record: {record_of(out)}")
     tell(f"measurement: {out}")
     judge(found)

@@ -12,11 +12,13 @@ from validation.commands.parts import (
     MeasurementFile,
     Options,
     ScenarioName,
+    SelfCalibrate,
     Threads,
     answering,
     judge,
     read_options,
     tell,
+    tell_scanner,
     use_threads,
 )
 
@@ -120,6 +122,7 @@ def measure(
             help="Keep intermediate results here. Unless given: beside FILE, and removed at the end.",
         ),
     ] = None,
+    self_calibrate: SelfCalibrate = None,
     threads: Threads = None,
 ) -> None:
     """Measure the motion of the sample at every load step, from the radiographs alone.
@@ -134,11 +137,12 @@ def measure(
         from pdvc.resumable import measure_into
         from validation.console import used
 
-        chosen = read_options(options)
+        chosen = read_options(options, self_calibrate)
         opened = read_experiment(experiment)
         use_threads(threads)
         found = measure_into(out, opened, chosen, work=work, progress=progress)
     tell(used(found))
+    tell_scanner(found)
     tell(f"measurement: {out}")
     judge(found)
 
@@ -209,6 +213,7 @@ def run(
     scenario: ScenarioName,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
     options: Options = "default",
+    self_calibrate: SelfCalibrate = None,
     threads: Threads = None,
 ) -> None:
     """Simulate, measure, score and report, in one folder; what is finished already is not done again.
@@ -225,7 +230,7 @@ def run(
 
         job = Job(
             scenario=load_scenario(scenario),
-            options=read_options(options),
+            options=read_options(options, self_calibrate),
             folder=out,
             workers=threads,
         )
@@ -238,6 +243,7 @@ def run(
     for part in outcome.reused:
         tell(f"{part}: finished before, kept")
     Console().print(summary(outcome.scores))
+    tell_scanner(outcome.measurement)
     tell(f"report: {outcome.report}")
     judge(outcome.measurement)
 

@@ -30,6 +30,15 @@ Options = Annotated[
         help="How to measure: a built-in protocol, default or paper, or a TOML file such as 'options' prints.",
     ),
 ]
+SelfCalibrate = Annotated[
+    str | None,
+    typer.Option(
+        "--self-calibrate",
+        metavar="none|geometry|motion",
+        help="Correct the scanner by the reference scan itself: axis and roll, or these and motion of its views. "
+        "Unless given: as --options says, none by default.",
+    ),
+]
 Threads = Annotated[
     int | None,
     typer.Option(
@@ -67,11 +76,33 @@ def judge(measurement: Measurement) -> None:
         raise typer.Exit(NOT_BELIEVED)
 
 
-def read_options(name: str) -> MeasureOptions:
-    """Return a built-in protocol by its name, or the options of a TOML file."""
+def read_options(name: str, self_calibrate: str | None = None) -> MeasureOptions:
+    """Return a built-in protocol by its name, or the options of a TOML file; self-calibrated otherwise, if given."""
     from pdvc.options import PROTOCOLS, MeasureOptions
 
-    return PROTOCOLS[name]() if name in PROTOCOLS else MeasureOptions.read(Path(name))
+    found = PROTOCOLS[name]() if name in PROTOCOLS else MeasureOptions.read(Path(name))
+    if self_calibrate is None:
+        return found
+    asked = MeasureOptions.parse({"self_calibration": self_calibrate}, where="--self-calibrate")
+    return found.model_copy(update={"self_calibration": asked.self_calibration})
+
+
+def tell_scanner(measurement: Measurement) -> None:
+    """Print on stderr what was found of the scanner, and left out, where it was asked for."""
+    for line in measurement.correction.lines if measurement.correction else ():
+        tell(f"self-calibration: {line}")
+    beam = measurement.recording.brightness
+    if beam is not None:
+        tell(
+            f"brightness: {beam[:, 0].min():.4f} to {beam[:, 0].max():.4f} of the flats, "
+            f"+- {beam[:, 1].max():.4f} at most, told by air"
+        )
+    elif 'brightness = "air"' in measurement.provenance.options:
+        tell("brightness: no air is seen beside the sample, taken to be that of the flats")
+    outliers = measurement.fit.outliers
+    if outliers is not None:
+        of_step = outliers.sum(axis=(1, 2))
+        tell(f"outliers: {of_step.sum()} pixels of {(of_step > 0).sum()} radiographs left out")
 
 
 def use_threads(count: int | None) -> None:

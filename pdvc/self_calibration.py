@@ -1,0 +1,268 @@
+"""Find what a scanner is from its own reference scan (Jailin et al., Meas. Sci. Technol. 29 (2018) 024003).
+
+The scan is reconstructed with a trial correction p and projected again; what that leaves of the views,
+
+    e(p) = P_p R_p g_p - g_p,           R reconstructs, P projects, g_p the views moved back
+
+is made least by Gauss-Newton steps. Registering the views to a fixed volume would be biased: the volume is made of the
+same views with the same p, and has taken up part of the error. So the sensitivities are those of the whole,
+
+    J_i = [e(p + h_i) - e(p)] / h_i         a reconstruction and a projection for each parameter
+
+and hold only what no other volume does as well. Over G_i, what the parameter does to the views by themselves,
+|J_i| / |G_i| is the share of it that is seen. What a volume takes up is what a sample does that stands elsewhere:
+to the right, and turned about the beam, a wave of one period in a turn; downwards, a constant. Of a drift (from -1/2
+to 1/2 over the turn) and of a bend (t^2) there are left, by their Fourier series,
+
+    1 - 6 / pi^2 = 0.63^2      and      1 - 90 / pi^4 = 0.28^2
+
+to the right, and nearly all downwards. What is seen to a share under `LEAST_SEEN` is left as told, and said. Motion
+that is not told from zero by `TOLD` deviations is left, too: errors that the volume makes otherwise, by interpolation
+and by its few views, would pass for it.
+
+Standard deviations come from blocks of pixels that err independently of each other, as in `pdvc.coherent`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from pdvc.correction import (
+    DIRECTIONS,
+    GEOMETRY,
+    MOTION,
+    UNSEEN,
+    Correction,
+    Parameter,
+    State,
+    corrected,
+    moved_back,
+    view_motion,
+)
+from pdvc.experiment import Series
+from pdvc.geometry import ConeBeam
+from pdvc.progress import Progress, silent
+from pdvc.projection import project_at_rest
+from pdvc.radiographs import Calibration, coarsened, grey_levels, sharpened
+from pdvc.rays import ray_vectors
+from pdvc.reconstruction import fdk, one_of
+from pdvc.volume import Hull, Volume
+from pdvc.window import reached_rows, scan_grid
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+Sought = Literal["geometry", "motion"]
+"""What is sought: the geometry alone, or the motion of the views besides."""
+
+ROWS = (120, 240)
+"""Rows of the binned views, about: first all is found at the first, then it is made better at the second."""
+BLUR_PX = 1.0
+"""Gaussian that binned views go through, px of theirs: interpolation errs the less, wherever it is."""
+STEP_PX = 0.25
+"""Step of the differences, px of the binned views."""
+CONVERGED_PX = 0.005
+"""Largest change of a round, px as stored, under which it was the last one."""
+MOST_ROUNDS = 6
+LEAST_SEEN = 0.1
+"""Share of what a parameter does that has to be seen for it to be sought."""
+TOLD = 4.0
+"""Deviations by which the motion of views differs from zero, or is none."""
+DEVIATION_PX = {"geometry": 5.0, "motion": 1.0}
+"""Deviations before the data, px."""
+BLOCKS = 8
+"""Blocks of views, and of rows: errors of different ones are independent."""
+RENEWED_PX = 0.2
+"""Change of a round from which on sensitivities are found anew in the next."""
+_MARGIN_ROWS = 2
+_HULL_MARGIN_VOXEL = 3.0
+
+
+def self_calibrated(
+    series: Series,
+    told: ConeBeam,
+    calibration: Calibration,
+    hull: Hull,
+    sought: Sought,
+    *,
+    axis_px: float = 0.0,
+    progress: Progress = silent,
+) -> Correction:
+    """Find the correction of a full scan: of the geometry as `told`, and with ``motion`` of each view, too.
+
+    `calibration` with the beam-hardening polynomial; `hull` encloses the sample. `axis_px` is a first guess: the
+    column where the axis is seen less the one where it is due, as of `pdvc.seen_twice`.
+    """
+    names = (*GEOMETRY, *(MOTION if sought == "motion" else ()))
+    nothing = dict.fromkeys(names, 0.0)
+    scales = list(dict.fromkeys(max(1, round(told.rows / rows)) for rows in ROWS))
+    scans = [_Scan(series, told, calibration, hull, scale) for scale in scales]
+    coarse, fine = scans[0], scans[-1]
+    before = _rms(fine.left(nothing))
+    # the axis first: what else is seen is told the better
+    start = coarse.settled({**nothing, "column_shift": -axis_px}, ["column_shift"], progress)
+    changes = coarse.changes(start.values, names, coarse.left(start.values), progress)
+    shares = coarse.shares(start.values, names, changes)
+    seen = [name for name in names if shares[name] >= LEAST_SEEN]
+    found = coarse.settled(start.values, seen, progress, changes[[names.index(name) for name in seen]])
+    told_apart = [name for name in seen if name in GEOMETRY or abs(found.values[name]) > TOLD * found.std[name]]
+    std, rounds = found.std, start.rounds + found.rounds
+    values = {name: value if name in told_apart else 0.0 for name, value in found.values.items()}
+    for scan in scans if len(told_apart) < len(seen) else scans[1:]:
+        found = scan.settled(values, told_apart, progress)
+        values, rounds = found.values, rounds + found.rounds
+    std = {**std, **found.std}
+
+    def parameter(name: str) -> Parameter:
+        state: State = "not observable" if name not in seen else "found" if name in told_apart else "none"
+        return Parameter(
+            name=name, value_px=values[name], std_px=std.get(name, np.nan), seen=shares[name], state=state
+        )
+
+    depth = hull.radius_mm() / 2 / told.source_axis_mm
+    unseen = (Parameter(name=name, seen=depth * by, state="not observable") for name, by in UNSEEN.items())
+    return Correction(
+        parameters=(*map(parameter, names), *unseen),
+        rounds=rounds,
+        last_change_px=found.change_px,
+        rms_before=before,
+        rms_after=_rms(fine.left(values)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Settled:
+    """Where the rounds at one scale ended."""
+
+    values: dict[str, float]
+    """Of all parameters, px."""
+    std: Mapping[str, float]
+    """Of those that were sought."""
+    change_px: float
+    rounds: int
+
+
+class _Scan:
+    """A full scan at a scale: what a correction leaves of it, and how that changes with the correction."""
+
+    def __init__(self, series: Series, told: ConeBeam, calibration: Calibration, hull: Hull, scale: int) -> None:
+        chosen = one_of(series.angle_rad, max(scale // 2, 1))
+        self._told, self._hull, self._scale = told, hull, scale
+        self._series = replace(
+            series,
+            counts=series.counts[chosen],
+            angle_rad=series.angle_rad[chosen],
+            time_s=series.time_s[chosen],
+            force_N=series.force_N[chosen],
+        )
+
+        def view(i: int) -> Image:
+            seen = coarsened(grey_levels(series.counts[i], calibration), scale)
+            return np.asarray(ndimage.gaussian_filter(seen, BLUR_PX, mode="nearest"))
+
+        # a view is read and filtered by one thread
+        with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+            self._views = np.stack(list(pool.map(view, chosen.tolist())))
+        geometry = told.binned(scale)
+        self._grid = scan_grid(geometry, hull)
+        rows = reached_rows(geometry, self._grid, hull)
+        self._rows = slice(rows.start + _MARGIN_ROWS, rows.stop - _MARGIN_ROWS)
+
+    def views(self, values: Mapping[str, float]) -> Image:
+        """Return the views (view, row, column) moved back."""
+        way = view_motion(values, self._series)
+        if not way.any():
+            return self._views
+        with ThreadPoolExecutor(numba.get_num_threads()) as pool:
+            return np.stack(list(pool.map(lambda view, px: moved_back(view, px, self._scale), self._views, way)))
+
+    def left(self, values: Mapping[str, float]) -> Image:
+        """Return e (view, row, column), grey levels, of the rows whose rays stay in the volume."""
+        views, angle = self.views(values), self._series.angle_rad
+        geometry = corrected(self._told, values).binned(self._scale)
+        volume = Volume(
+            values=fdk(lambda i: sharpened(views[i]), geometry, angle, self._grid, self._hull),
+            grid=self._grid,
+            hull=self._hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm),
+        )
+        again = project_at_rest(volume, ray_vectors(geometry, angle).stacked(), views[0].shape)
+        return np.asarray((again - views)[:, self._rows])
+
+    def changes(self, values: Mapping[str, float], names: Sequence[str], e: Image, progress: Progress) -> Image:
+        """Return J (parameter, view, row, column), grey levels per px, at values where `left` is e."""
+        step = STEP_PX * self._scale
+        result = np.empty((len(names), *e.shape), dtype=np.float32)
+        for k, name in enumerate(names):
+            result[k] = (self.left({**values, name: values[name] + step}) - e) / step
+            progress(f"self-calibration, scale {self._scale}", k + 1, len(names))
+        return result
+
+    def shares(self, values: Mapping[str, float], names: Sequence[str], changes: Image) -> dict[str, float]:
+        """Return |J| / |G| of each parameter: what the volume cannot take up of what it does to the views."""
+        step, here = STEP_PX * self._scale, self.views(values)
+        direct = (_moved_flat(here, name, step, self._series, self._scale) - here for name in names)
+        return {
+            name: _rms(change) / max(_rms(by_itself[:, self._rows] / step), 1e-30)
+            for name, change, by_itself in zip(names, changes, direct, strict=True)
+        }
+
+    def settled(
+        self, start: Mapping[str, float], names: Sequence[str], progress: Progress, changes: Image | None = None
+    ) -> _Settled:
+        """Return where Gauss-Newton steps from `start` end, in some parameters; `changes` are J there, if known."""
+        values, rounds, last = dict(start), 0, np.inf
+        deviation = np.array([DEVIATION_PX["geometry" if name in GEOMETRY else "motion"] for name in names])
+        e = self.left(values)
+        while True:
+            if changes is None or (rounds and last > RENEWED_PX):
+                changes = self.changes(values, names, e, progress)
+            now = np.array([values[name] for name in names])
+            change, std = _change(changes, e, now, deviation)
+            values |= dict(zip(names, (now + change).tolist(), strict=True))
+            e, rounds, last = self.left(values), rounds + 1, float(np.abs(change).max())
+            if last < CONVERGED_PX or rounds == MOST_ROUNDS:
+                break
+        return _Settled(values=values, std=dict(zip(names, std.tolist(), strict=True)), change_px=last, rounds=rounds)
+
+
+def _change(changes: Image, e: Image, now: Floats, deviation: Floats) -> tuple[Floats, Floats]:
+    """Return the Gauss-Newton step (parameter,), px, from values `now`, and the standard deviations there.
+
+    `changes` (parameter, view, row, column), `e` (view, row, column), `deviation` (parameter,) that of the prior, px.
+    """
+    flat = changes.reshape(len(changes), -1)
+    matrix = (flat @ flat.T).astype(float)
+    blocks = [
+        changes[:, views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].reshape(len(changes), -1)
+        @ e[views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].ravel()
+        for views in np.array_split(np.arange(e.shape[0]), BLOCKS)
+        for rows in np.array_split(np.arange(e.shape[1]), BLOCKS)
+    ]
+    scores = np.stack(blocks).astype(float)
+    gradient, covariance = scores.sum(axis=0), scores.T @ scores
+    # e is no white noise: its variance is what the blocks make of it
+    variance = float(np.median(np.diag(covariance) / np.diag(matrix)))
+    ridge = np.diag(variance / deviation**2)
+    inverse = np.linalg.inv(matrix + ridge)
+    std = np.sqrt(np.diag(inverse @ (covariance + variance * ridge) @ inverse))
+    return -inverse @ (gradient + ridge @ now), std
+
+
+def _moved_flat(views: Image, name: str, step_px: float, series: Series, scale: int) -> Image:
+    """Return views that a parameter has moved by a step, as if the sample were flat, in the plane of the axis."""
+    way = view_motion({name: step_px}, series)
+    if name in GEOMETRY:
+        way[:, DIRECTIONS.index(GEOMETRY[name])] = step_px
+    return np.stack([moved_back(view, px, scale) for view, px in zip(views, way, strict=True)])
+
+
+def _rms(image: Image) -> float:
+    return float(np.sqrt(np.mean(np.square(image, dtype=float))))
