@@ -100,6 +100,16 @@ def test_the_image_is_blurred_as_its_noise_is():
     assert correlated(still, 0.0) is still
 
 
+def test_the_filter_of_the_noise_leaves_the_image_alone():
+    """Its blur is in the image already, where rays end and not only pixels."""
+    image = np.ones((20, 30), dtype=np.float32)
+    image[:, 15:] = 0.2
+    maps = detector_maps(QUIET, 20, 30, np.random.default_rng(0))
+    conditions = Conditions(panel=Panel(scintillator_blur_px=0.8))
+    counts = record(image, QUIET, maps, np.random.default_rng(1), conditions)
+    np.testing.assert_allclose((counts - QUIET.dark_counts) / QUIET.counts_full, image, atol=1e-4)
+
+
 def test_gains_that_drift_leave_a_pattern_that_grows_with_time():
     panel = Panel(gain_drift_per_hour=0.004)
     at_once, later, again = (signal(panel, 0.8, time_s=time_s, seed=n) for n, time_s in enumerate((0, 1800, 3600)))
