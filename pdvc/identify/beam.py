@@ -88,9 +88,7 @@ def unloaded(force_N: Floats, noise_N: float) -> NDArray[np.bool_]:
     return np.asarray(force_N < before - max(UNLOADS * noise_N, 1e-9 * float(np.abs(force_N).max(initial=0.0))))
 
 
-def strains(
-    law: Law, profile: Profile, force_N: Floats, *, noise_N: float = 0.0, bridgman: bool = False
-) -> Strains:
+def strains(law: Law, profile: Profile, force_N: Floats, *, noise_N: float = 0.0, bridgman: bool = False) -> Strains:
     """Return the strains of a beam at forces (step,), N, not negative, which follow each other in this order."""
     below = unloaded(force_N, noise_N)
     most = np.where(below, np.maximum.accumulate(np.where(below, 0.0, force_N)), force_N)
@@ -124,7 +122,10 @@ def force_at_stroke(
         for _ in range(_ROUNDS):
             found = strains(law, profile, np.array([force]))
             taken = compliance_mm_per_N * (force - start_N) + elongation_mm(found.total, profile)[0] - at_start
-            give = compliance_mm_per_N + elongation_mm((1 / law.young_MPa + found.plastic_per_MPa) / profile.area_mm2, profile)[0]
+            give = (
+                compliance_mm_per_N
+                + elongation_mm((1 / law.young_MPa + found.plastic_per_MPa) / profile.area_mm2, profile)[0]
+            )
             change = (wanted - taken) / give
             # at the yield point the tangent jumps, and a long step would land far beyond it
             force += float(np.clip(change, -0.2 * force, 0.05 * force))

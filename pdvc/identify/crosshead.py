@@ -56,6 +56,4 @@ def from_crosshead(model: Model, force_N: Floats, stroke_mm: Floats, loaded: int
         found = solved.x
     covariance = np.linalg.inv(solved.jac.T @ solved.jac) * np.outer(deviation, deviation)
     away = solved.fun[: len(force_N) - loaded]
-    return Estimate(
-        vector=mean + found * deviation, covariance=covariance, misfit=float(np.sqrt(np.mean(away**2)))
-    )
+    return Estimate(vector=mean + found * deviation, covariance=covariance, misfit=float(np.sqrt(np.mean(away**2))))

@@ -44,6 +44,9 @@ MOST_STEPS = 12
 """Steps of theta, at most, for the equations of one pass."""
 SETTLED = 0.03
 """Share of its standard deviation that theta changes by when it has settled."""
+FAR = 3.0
+"""Standard deviations beyond which a change is shortened unless the posterior grows."""
+HALVINGS = 6
 LONGEST_STEP = 0.7
 """Change of an unknown in one step, at most: of a logarithm, or in prior deviations."""
 
@@ -122,7 +125,9 @@ def integrated(
     """
     asked = (0 if deviations else ROUNDS) if rounds is None else rounds
     with one_thread():
-        return _summed(model, _settled(model, force_N, start, radiographs, deviations, asked), radiographs)
+        known = deviations or radiographs.spaces[0].first_guess()
+        settled = _settled(model, force_N, start, radiographs, radiographs.spaces[1], known, asked)
+        return _summed(model, settled, radiographs)
 
 
 def free_motion(radiographs: Radiographs, deviations: Deviations | None = None) -> tuple[Floats, Floats, Deviations]:
@@ -144,9 +149,17 @@ def free_motion(radiographs: Radiographs, deviations: Deviations | None = None) 
 def log_evidence(
     model: Model, force_N: Floats, start: Floats, radiographs: Radiographs, deviations: Deviations
 ) -> float:
-    """Return the logarithm of a law's evidence, up to a constant, for deviations of the process found before."""
+    """Return the logarithm of a law's evidence, up to a constant, for deviations of the process found before.
+
+    With few modes of whatever moves beside the law: the constant is another one than with all.
+    """
     with one_thread():
-        return _log_evidence(_settled(model, force_N, start, radiographs, deviations, 0), radiographs)
+        try:
+            few = radiographs.spaces[0]
+            return _log_evidence(_settled(model, force_N, start, radiographs, few, deviations, 0), few)
+        except np.linalg.LinAlgError:
+            # no motion is likely under the law
+            return -np.inf
 
 
 def _settled(
@@ -154,12 +167,12 @@ def _settled(
     force_N: Floats,
     start: Floats,
     radiographs: Radiographs,
-    deviations: Deviations | None,
+    space: StateSpace,
+    known: Deviations,
     rounds: int,
 ) -> _Settled:
     """Go from a start to the unknowns of the largest posterior; deviations are sought in some rounds."""
     vector, lying = start, force_N
-    known = deviations or radiographs.spaces[0].first_guess()
     for _ in range(MOST_STEPS):
         about = _About.at(model, vector, lying, force_N, radiographs)
         if rounds:
@@ -167,20 +180,52 @@ def _settled(
             # half of the rounds at first, and one each time that the unknowns have moved
             now = max(rounds // 2, 1)
             known, rounds = few.fitted(known, now), rounds - now
-        process = Process(radiographs.spaces[1].with_trend(about.columns), about.seen)
+        process = Process(space.with_trend(about.columns), about.seen)
         smoothed = process.smoothed(known)
         scaled = _OfUnknowns(process, about.scale)
         found = model.unknowns.mean + smoothed.trend[-len(start) :] * about.scale
         deviation = scaled.deviation(smoothed)
         limit = np.minimum(LONGEST_STEP, LONGEST_STEP * model.unknowns.deviation)
         share = min(1.0, float(np.min(limit / np.maximum(np.abs(found - vector), 1e-300))))
-        change, vector = found - vector, vector + share * (found - vector)
+        change = found - vector
+        if np.abs(change / deviation).max() > FAR:
+            share = _shortened(model, vector, change, share, lying, force_N, radiographs, space, known)
+        vector = vector + share * change
         lying = about.force(process, smoothed, known)
         if share == 1.0 and np.abs(change / deviation).max() < SETTLED and not rounds:
             break
     return _Settled(
         vector=vector, force_N=lying, about=about, process=scaled, motion=process, smoothed=smoothed, deviations=known
     )
+
+
+def _shortened(
+    model: Model,
+    vector: Floats,
+    change: Floats,
+    share: float,
+    lying: Floats,
+    force_N: Floats,
+    radiographs: Radiographs,
+    space: StateSpace,
+    known: Deviations,
+) -> float:
+    """Return the share of a change, halved as often as it takes, at which the posterior is no smaller than before."""
+
+    def log_posterior(trial: Floats) -> float:
+        about = _About.at(model, trial, lying, force_N, radiographs)
+        moved = about.columns @ ((trial - model.unknowns.mean) / about.scale)
+        left = about.seen.data - np.einsum("tnm,tm->tn", about.seen.design, moved)
+        likely = Process(space, replace(about.seen, data=left)).smoothed(known).log_likelihood
+        away = (trial - model.unknowns.mean) / model.unknowns.deviation
+        return float(likely + np.linalg.slogdet(about.white)[1].sum() - away @ away / 2)
+
+    before = log_posterior(vector)
+    for _ in range(HALVINGS):
+        if log_posterior(vector + share * change) >= before:
+            break
+        share /= 2
+    return share
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,17 +310,17 @@ def _summed(model: Model, settled: _Settled, radiographs: Radiographs) -> Identi
         amplitude=about.offset + moved,
         of_law=model.amplitude(settled.vector, settled.force_N),
         force_N=settled.force_N,
-        log_evidence=_log_evidence(settled, radiographs),
+        log_evidence=_log_evidence(settled, radiographs.spaces[1]),
         by_source=parts,
     )
 
 
-def _log_evidence(settled: _Settled, radiographs: Radiographs) -> float:
+def _log_evidence(settled: _Settled, space: StateSpace) -> float:
     """Return the logarithm of the marginal likelihood with what differs from law to law.
 
     The volume of the prior of the unknowns, and that of the noise, which the force's is a part of.
     """
-    about, wide = settled.about, radiographs.spaces[1].prior_voxel
+    about, wide = settled.about, space.prior_voxel
     white = np.linalg.slogdet(about.white)[1].sum()
     return float(settled.smoothed.log_likelihood + white - len(about.scale) * np.log(wide))
 

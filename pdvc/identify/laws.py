@@ -26,6 +26,9 @@ LEAST_PLASTIC, MOST_PLASTIC = 1e-12, 1.0
 """Plastic strains between which a root is sought; a stress that asks for more is beyond what the law carries."""
 _NEARBY = 1e-5
 """Share of p over which slopes are taken."""
+_STARTS_AT, _STARTS_WITH = 0.1, 1.1
+"""A law to start from has a tenth more than the largest stress at a plastic strain of 0.1: one that cannot carry a test
+has no slope that leads to one that can."""
 _ROUNDS = 60
 _TABLE = 512
 """Plastic strains at which a law is looked up to bracket a root."""
@@ -61,6 +64,13 @@ class Law(Choice):
     def with_values(self, values: Mapping[str, float]) -> Self:
         """Return the law with other values of some parameters."""
         return self.model_copy(update={name: float(value) for name, value in values.items()})
+
+    def started_for(self, stress_MPa: float) -> Self:
+        """Return the law to start from for a test up to a stress: all its stresses scaled, to carry a little more."""
+        carried = float(self.flow_MPa(np.array([_STARTS_AT]))[0])
+        share = _STARTS_WITH * stress_MPa / carried
+        stresses = {name: value for name, value in self.values().items() if name.endswith("_MPa")}
+        return self.with_values({name: share * value for name, value in stresses.items() if name != "young_MPa"})
 
 
 class Ludwik(Law):

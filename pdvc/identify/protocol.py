@@ -113,6 +113,11 @@ class Ready:
         time_s = self.experiment.test.time_s
         return np.asarray(self.options.stroke_mm_per_s * np.maximum(time_s - time_s[self.loaded], 0.0))
 
+    @property
+    def largest_MPa(self) -> float:
+        """Return the largest stress of the test, that of the smallest section."""
+        return float(self.force_N.max() / self.model.profile.area_mm2.min())
+
     def spaces(self) -> tuple[StateSpace, StateSpace]:
         """Return the states of whatever moves beside the law, in few modes and in all."""
         solver, series = Smoother(), self.problem.series
@@ -157,8 +162,11 @@ def ready(
         height_mm=profile.height_mm,
         shift_mm=shift_of(basis, amplitude.reshape(-1, *basis.shape), voxel_mm),
     )
+    largest_MPa = float(used.test.force_N.max() / profile.area_mm2.min())
+    starts = options.law == type(options.law)()
     model = Model(
-        law=options.law,
+        # values that the user gave stay
+        law=options.law.started_for(largest_MPa) if starts else options.law,
         profile=profile,
         area_deviation=share,
         reference_N=float(np.mean(experiment.reference.force_N)),
@@ -369,14 +377,18 @@ def _integrated(opened: Ready, start: Floats) -> tuple[Identified, Radiographs]:
 
 def _compared(opened: Ready, found: Identified, radiographs: Radiographs) -> dict[str, float]:
     """Return the log evidence of the law and of those that it is compared with, less the law's own."""
-    kind, own = str(opened.options.law.kind), found.log_evidence
+    kind = str(opened.options.law.kind)
     others = [other for other in opened.options.compare if other != kind]
-    result = {kind: 0.0} if others else {}
+    if not others:
+        return {}
+    flat = zeroed(opened.amplitude, opened.loaded)
+    own = log_evidence(opened.model, opened.force_N, found.estimate.vector, radiographs, found.deviations)
+    result = {kind: 0.0}
     for other in others:
-        asked = replace(opened, model=replace(opened.model, law=law_named(other)))
-        flat = zeroed(opened.amplitude, opened.loaded)
-        start = unweighted(asked.model, flat, opened.seen, found.force_N, opened.sections).vector
-        result[other] = log_evidence(asked.model, opened.force_N, start, radiographs, found.deviations) - own
+        law = law_named(other).started_for(opened.largest_MPa)
+        model = replace(opened.model, law=law)
+        start = unweighted(model, flat, opened.seen, found.force_N, opened.sections).vector
+        result[other] = log_evidence(model, opened.force_N, start, radiographs, found.deviations) - own
     return result
 
 

@@ -1,9 +1,9 @@
-"""Two steps: first the motion, as measured, then the law whose motion is nearest to it (finite element model updating).
+"""Two steps: first the motion, as measured, then the law with the nearest one (finite element model updating).
 
 Weighted, distances are in the covariance of each step's measured motion, with what the noise of the recorded force
 adds to it. A measurement's file tells no covariance between steps, so that each step counts as if it were
-independent. Unweighted, as laboratories often do it, all displacements count alike and the force is taken as exact; the
-scatter that is left tells the deviations.
+independent. Unweighted, as laboratories often do it, all displacements count alike and the force is taken as exact;
+the scatter that is left tells the deviations.
 
 The sample's shift along the beam is free at each step. Compared are the axial motion and the contraction.
 """

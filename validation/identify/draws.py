@@ -151,7 +151,9 @@ class Draw:
         with simulated(self.scenario, shared) as (experiment, _, _):
             return Result(scores=self._identified(experiment, measurement, first))
 
-    def _identified(self, experiment: Experiment, measurement: Measurement, first: dict[str, Any]) -> dict[str, Scalar]:
+    def _identified(
+        self, experiment: Experiment, measurement: Measurement, first: dict[str, Any]
+    ) -> dict[str, Scalar]:
         took: dict[str, float] = {}
         clock = time.perf_counter()
 
@@ -197,9 +199,7 @@ class Draw:
 def draws(scenario: Scenario, options: IdentifyOptions, count: int) -> list[Draw]:
     """Return draws of a scenario, their noise numbered from 1; the crosshead's rate is told."""
     told = options.model_copy(update={"stroke_mm_per_s": scenario.loading.stroke_mm_per_s})
-    return [
-        Draw(scenario=scenario.model_copy(update={"repetition": n}), options=told) for n in range(1, count + 1)
-    ]
+    return [Draw(scenario=scenario.model_copy(update={"repetition": n}), options=told) for n in range(1, count + 1)]
 
 
 def _covariances(measurement: Measurement, opened: Ready) -> Floats:
