@@ -72,7 +72,7 @@ class Strains:
     most_MPa: Floats
     """Largest stress so far, which the plastic strain follows (step, height), MPa."""
     plastic_per_MPa: Floats
-    """d plastic / d most_MPa, consistent with what was solved (step, height), 1/MPa; zero where nothing has yielded."""
+    """d plastic / d most_MPa, consistent with what was solved (step, height), 1/MPa; zero where none is."""
     flows: NDArray[np.bool_]
     """(step, 1) whether the stress of a step is its largest so far."""
 

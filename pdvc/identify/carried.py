@@ -1,8 +1,8 @@
 """The motion of a stretched beam as section amplitudes: what a law says that the sections of `pdvc.sections` do.
 
-Material at height Z moves by U(Z) = int e dZ, from the middle of the sections, along the beam and shrinks to the share s(Z) across it. The sample has
-moved as a whole meanwhile, so that a section at height z holds the material of z = Z + d + U(Z), with d the height
-that a measured motion tells. There
+Material at height Z moves by U(Z) = int e dZ, from the middle of the sections, along the beam, and shrinks across it to
+the share s(Z). The sample has moved as a whole meanwhile, so that a section at height z holds the material of
+z = Z + d + U(Z), with d the height that a measured motion tells. There
 
     u_z(z) = U(Z)            u_xy(x) = (1 - 1 / s) x
 
@@ -101,7 +101,7 @@ class Carrier:
         """Return fine heights, and the matrix (section, fine height) that fits hats to values there."""
         sections = self.basis.height_mm
         fine = np.linspace(sections[0], sections[-1], FINE * (len(sections) - 1) + 1)
-        return fine, np.linalg.pinv(self.basis.weights(fine))
+        return fine, np.asarray(np.linalg.pinv(self.basis.weights(fine)), dtype=float)
 
 
 def shift_of(basis: SectionBasis, amplitude: Floats, voxel_mm: float) -> Floats:

@@ -27,8 +27,8 @@ LEAST_PLASTIC, MOST_PLASTIC = 1e-12, 1.0
 _NEARBY = 1e-5
 """Share of p over which slopes are taken."""
 _STARTS_AT, _STARTS_WITH = 0.1, 1.1
-"""A law to start from has a tenth more than the largest stress at a plastic strain of 0.1: one that cannot carry a test
-has no slope that leads to one that can."""
+"""A law to start from carries a tenth more than the largest stress at a plastic strain of 0.1: one that cannot carry a
+test has no slope that leads to one that can."""
 _ROUNDS = 60
 _TABLE = 512
 """Plastic strains at which a law is looked up to bracket a root."""
@@ -182,7 +182,7 @@ def law_named(kind: str) -> Law:
     for _ in range(2):
         for each in Law.kinds():
             if each.model_fields["kind"].default == kind:
-                return each()
+                return each.model_validate({})
         load_plugins()
     known = ", ".join(str(each.model_fields["kind"].default) for each in Law.kinds())
     raise SettingsError(f"law: expected one of {known}, or what an installed plug-in offers, got {kind!r}")

@@ -7,8 +7,8 @@ Gaussian prior: broad for the law's, as narrow as stated for the others. The tra
     s = 1 - nu_e e_elastic - nu_p e_plastic
 
 Towards the end a neck may form, which no law of stress and strain tells. Its strain is a Gaussian about the smallest
-section, as wide as that is thick, whose height follows three ramps over the last quarter of the loaded steps, all free:
-what these say of the law is given up for not being misled by a neck.
+section, with a width of half that section's, which grows by three ramps over the last quarter of the loaded steps, all
+free: what the ligament then says of the law is given up for not being misled by a neck.
 
 Strains count from the reference scan, which was made at a force F_0.
 """

@@ -45,7 +45,7 @@ def outline_of(volume: Volume, low_mm: float, high_mm: float) -> tuple[Floats, F
     if not len(chosen) or not values.max() > 0:
         raise ValueError(f"volume: expected a sample between {low_mm:.4g} and {high_mm:.4g} mm, found none")
     level = matrix_level(values)
-    middle = ndimage.center_of_mass((values > level / 2).any(axis=0))
+    middle: tuple[float, ...] = ndimage.center_of_mass((values > level / 2).any(axis=0))
     angle = 2 * np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
     along = np.arange(0, np.hypot(*values.shape[1:]) / 2, RADIAL_VOXEL)
     places = [centre + np.outer(turned(angle), along) for centre, turned in zip(middle, (np.sin, np.cos), strict=True)]
@@ -57,7 +57,7 @@ def outline_of(volume: Volume, low_mm: float, high_mm: float) -> tuple[Floats, F
         raise ValueError("volume: expected a sample around the middle of each slice, found air there")
     # an inclusion from the middle to the surface is a dent, too
     found = np.nan_to_num(radius[first:last])
-    return z[chosen][first:last], _followed(found, grid.voxel_mm) * grid.voxel_mm
+    return np.asarray(z[chosen][first:last]), _followed(found, grid.voxel_mm) * grid.voxel_mm
 
 
 def areas_of(radius_mm: Floats) -> tuple[Floats, Floats]:
@@ -89,7 +89,7 @@ def _radii(share: Floats) -> Floats:
     rows, next_ = np.arange(len(share)), np.minimum(last + 1, share.shape[1] - 1)
     inner, outer = share[rows, last], share[rows, next_]
     part = (inner - 0.5) / np.maximum(inner - outer, 1e-6)
-    return np.where(found, (last + part) * RADIAL_VOXEL, np.nan)
+    return np.asarray(np.where(found, (last + part) * RADIAL_VOXEL, np.nan))
 
 
 def _followed(radius: Floats, voxel_mm: float) -> Floats:
@@ -101,7 +101,7 @@ def _followed(radius: Floats, voxel_mm: float) -> Floats:
     fit = ndimage.median_filter(radius, size=(odd(MEDIAN_MM), 1), mode="nearest")
     window = odd(PARABOLA_MM)
     if window < 5:
-        return fit
+        return np.asarray(fit)
     for _ in range(_ROUNDS):
         held = HELD * float(usual_size(radius - fit))
         fit = savgol_filter(np.clip(radius, fit - held, fit + held), window, 2, axis=0, mode="interp")

@@ -163,7 +163,7 @@ def ready(
         shift_mm=shift_of(basis, amplitude.reshape(-1, *basis.shape), voxel_mm),
     )
     largest_MPa = float(used.test.force_N.max() / profile.area_mm2.min())
-    starts = options.law == type(options.law)()
+    starts = options.law == law_named(str(options.law.kind))
     model = Model(
         # values that the user gave stay
         law=options.law.started_for(largest_MPa) if starts else options.law,

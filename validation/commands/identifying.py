@@ -19,8 +19,8 @@ Laws = Annotated[
     typer.Option(
         "--law",
         metavar="NAME",
-        help="The law: ludwik, voce, ramberg-osgood, swift, linear, multi-voce, or yours. Given again: laws to compare "
-        "it with. Unless given: ludwik, compared with all others.",
+        help="The law: ludwik, voce, ramberg-osgood, swift, linear, multi-voce, or yours. Again: laws to compare it "
+        "with. Unless given: ludwik, compared with all others.",
     ),
 ]
 Stroke = Annotated[
@@ -114,8 +114,8 @@ def identify_draws(
 ) -> None:
     """Identify the law of many noise draws of a scenario by every method: bias, random error, coverage, time.
 
-    Writes a row for each draw as soon as it is finished, and at the end DIR/table.csv and DIR/recovery.csv. Interrupted,
-    it goes on where it was when the same command is given again.
+    Writes a row for each draw as soon as it is finished, and at the end DIR/table.csv and DIR/recovery.csv.
+    Interrupted, it goes on where it was when the same command is given again.
 
     Example:  `pdvc-bench identify-draws quick --draws 50 -o out/draws`
     """

@@ -2,9 +2,9 @@
 
 The first draw is measured in full (`First`, a part that all draws share), and tells the deviations of the processes
 and the noise of all images. Each draw is then made ready by itself, counts, volume, areas, pattern and pass, at the
-motion that the first one found: the true motion is the same, and what draws differ by is far within what is linear. Its
-own motion, for the two-step methods, is one step of the smoother from there; the integrated identification seeks its
-process's deviations once more, from those of the first.
+motion that the first one found: the true motion is the same, and what draws differ by is far within what is linear.
+Its own motion, for the two-step methods, is one step of the smoother from there; the integrated identification seeks
+its process's deviations once more, from those of the first.
 """
 
 from __future__ import annotations

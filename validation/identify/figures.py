@@ -19,7 +19,8 @@ def draw_law(found: Identification, *, ax: Axes, truth: Law | None = None) -> Ax
     ax.fill_between(100 * plastic, low, high, color=BLUE, alpha=0.25, linewidth=0, label="95 %")
     ax.plot(100 * plastic, flow, color=BLUE, label=found.law)
     if truth is not None:
-        ax.plot(100 * plastic, truth.flow_MPa(plastic), label="true", **TRUTH)
+        (line,) = ax.plot(100 * plastic, truth.flow_MPa(plastic), label="true")
+        line.set(**TRUTH)
     ax.set_xlabel("plastic strain (%)")
     ax.set_ylabel("nominal stress (MPa)")
     ax.legend(frameon=False)

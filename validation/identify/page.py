@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+
+from matplotlib.axes import Axes
 
 from pdvc.identify.laws import Law, Ludwik
 from pdvc.identify.result import Identification
@@ -23,8 +25,8 @@ from validation.report.template import template
 
 CAPTIONS = {
     "law": "Flow stress against plastic strain, with the 95 % band of the integrated identification.",
-    "missed": "Where the law fails: strain of the free measurement less that of the law, in standard deviations of the "
-    "measurement.",
+    "missed": "Where the law fails: strain of the free measurement less that of the law, in the measurement's "
+    "standard deviations.",
     "correlation": "Correlations of the unknowns: what is near one, or minus one, the test tells only together.",
 }
 
@@ -35,14 +37,15 @@ def write_page(folder: Path, found: Identification, scenario: Scenario | None = 
     true_law: Law | None = None
     if scenario is not None:
         truth = truth_of(scenario.loading)
-        true_law = Ludwik(**truth)
+        true_law = Ludwik().with_values(truth)
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = []
-    for name, draw in (
-        ("law", lambda ax: draw_law(found, ax=ax, truth=true_law)),
-        ("missed", lambda ax: draw_missed(found, ax=ax)),
-        ("correlation", lambda ax: draw_correlation(found, ax=ax)),
-    ):
+    drawn: dict[str, Callable[[Axes], Axes]] = {
+        "law": lambda ax: draw_law(found, ax=ax, truth=true_law),
+        "missed": lambda ax: draw_missed(found, ax=ax),
+        "correlation": lambda ax: draw_correlation(found, ax=ax),
+    }
+    for name, draw in drawn.items():
         figure, (ax,) = new_figure(7.0, 4.0)
         draw(ax)
         data = save(figure, folder / "figures" / f"identification_{name}.png", dpi=120)
