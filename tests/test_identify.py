@@ -13,7 +13,8 @@ from pdvc.history import Angle, time_basis
 from pdvc.identify.beam import elongation_mm
 from pdvc.identify.carried import Carrier, shift_of
 from pdvc.identify.crosshead import from_crosshead
-from pdvc.identify.integrated import Radiographs, free_motion, integrated, log_evidence
+from pdvc.identify.expected import assumed, slower_near_yield, unloading
+from pdvc.identify.integrated import Radiographs, expected_covariance, free_motion, integrated, log_evidence
 from pdvc.identify.laws import Ludwik, Swift, law_named
 from pdvc.identify.model import Model, neck_ramps
 from pdvc.identify.outline import areas_of, matrix_level, outline_of, profile_of
@@ -286,3 +287,29 @@ def test_unknowns_in_their_own_units():
         "area_share", "poisson_elastic", "poisson_plastic", "neck_1", "neck_2", "neck_3",
     )  # fmt: skip
     assert unknowns.law(Swift(), unknowns.mean).values() == pytest.approx(Swift().values())
+
+
+def test_force_programmes_keep_their_steps_and_their_ends():
+    unloaded_twice = unloading(FORCE_N, LOADED)
+    slow = slower_near_yield(FORCE_N, LOADED, 350.0)
+    for programme in (unloaded_twice, slow):
+        assert len(programme) == STEPS
+        assert programme[-1] == pytest.approx(FORCE_N[-1])
+        np.testing.assert_array_equal(programme[:LOADED], FORCE_N[:LOADED])
+    assert (unloaded_twice[LOADED:] < 255).sum() >= 2
+    near = np.abs(slow[LOADED:] - 350) <= 0.15 * 350 + 1e-9
+    assert near.mean() >= 0.5
+    np.testing.assert_array_equal(slower_near_yield(FORCE_N, LOADED, 5000.0), FORCE_N)
+
+
+def test_unloading_shows_young_and_less_noise_shows_more():
+    model = replace(_model(), law=TRUE)
+    radiographs, _ = _radiographs(model, _truth(model), np.random.default_rng(4))
+    known = assumed(radiographs.spaces[1])
+    planned, cycled = (
+        np.sqrt(np.diag(expected_covariance(model, force, radiographs, known)))
+        for force in (FORCE_N, unloading(FORCE_N, LOADED))
+    )
+    assert cycled[0] < planned[0]
+    quiet = replace(model, force_noise_N=0.1)
+    assert (np.sqrt(np.diag(expected_covariance(quiet, FORCE_N, radiographs, known)))[:4] < planned[:4]).all()

@@ -103,3 +103,13 @@ def test_options_are_explained_as_toml():
     text = IdentifyOptions().template()
     assert "young_MPa" in text
     assert json.dumps("ludwik") in text
+
+
+def test_a_plan_tells_deviations_for_other_force_programmes(measured, tmp_path):
+    told = pdvc_bench("plan", measured / "experiment", "--law", "ludwik", "-o", tmp_path / "plan.csv")
+    assert told.exit_code == 0, told.output
+    lines = (tmp_path / "plan.csv").read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "force programme,young_MPa,yield_MPa,hardening_MPa,exponent"
+    assert [line.split(",")[0] for line in lines[1:]] == ["as planned", "2 unloadings", "slower near yield"]
+    numbers = np.array([line.split(",")[1:] for line in lines[1:]], dtype=float)
+    assert ((numbers > 1e-3) & (numbers < 1.01)).all()

@@ -1,7 +1,7 @@
 """The motion of a stretched beam as section amplitudes: what a law says that the sections of `pdvc.sections` do.
 
-Material at height Z moves by U(Z) = int e dZ, from the middle of the sections, along the beam, and shrinks across it to
-the share s(Z). The sample has moved as a whole meanwhile, so that a section at height z holds the material of
+Material at height Z moves by U(Z) = int e dZ, from the middle of the sections, along the beam, and shrinks across it
+to the share s(Z). The sample has moved as a whole meanwhile, so that a section at height z holds the material of
 z = Z + d + U(Z), with d the height that a measured motion tells. There
 
     u_z(z) = U(Z)            u_xy(x) = (1 - 1 / s) x

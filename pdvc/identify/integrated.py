@@ -130,6 +130,15 @@ def integrated(
         return _summed(model, settled, radiographs)
 
 
+def expected_covariance(model: Model, force_N: Floats, radiographs: Radiographs, deviations: Deviations) -> Floats:
+    """Return the covariance of the unknowns (unknown, unknown) of a test whose law is that of the prior's mean."""
+    with one_thread():
+        about = _About.at(model, model.unknowns.mean, force_N, force_N, radiographs)
+        process = Process(radiographs.spaces[1].with_trend(about.columns), about.seen)
+        smoothed = process.smoothed(deviations)
+        return _OfUnknowns(process, about.scale).covariance(smoothed, smoothed.factor.inverted())[0]
+
+
 def free_motion(radiographs: Radiographs, deviations: Deviations | None = None) -> tuple[Floats, Floats, Deviations]:
     """Return the motion (step, unknown), voxels, without a law, its covariances, and the process's deviations.
 

@@ -29,13 +29,13 @@ from pdvc.noise import Propagated, known_from_residual, propagate
 from pdvc.onset import force_noise, onset
 from pdvc.options import MeasureOptions
 from pdvc.pattern import fixed_pattern
-from pdvc.preparation import noise_of, prepare
+from pdvc.preparation import Prepared, noise_of, prepare
 from pdvc.process import FITTED_MODES
 from pdvc.progress import Progress, silent
 from pdvc.protocol import versions
 from pdvc.sections import TRANSLATION_Z, SectionBasis
 from pdvc.settings import Settings
-from pdvc.setup import set_up
+from pdvc.setup import Setup, set_up
 from pdvc.smoother import Smoother
 from pdvc.solution import Problem
 from pdvc.state_space import StateSpace
@@ -117,15 +117,6 @@ class Ready:
     def largest_MPa(self) -> float:
         """Return the largest stress of the test, that of the smallest section."""
         return float(self.force_N.max() / self.model.profile.area_mm2.min())
-
-    def spaces(self) -> tuple[StateSpace, StateSpace]:
-        """Return the states of whatever moves beside the law, in few modes and in all."""
-        solver, series = Smoother(), self.problem.series
-        trend, prior = time_basis(solver.trend, series), float(self.problem.prior.deviation_voxel.max())
-        few, every = (
-            solver.space(self.problem.basis, series.time_s, trend, prior, modes) for modes in (FITTED_MODES, None)
-        )
-        return few, every
 
     def two_steps(self, amplitude: Floats, covariance: Floats, start: Floats | None = None) -> dict[str, Estimate]:
         """Return what a measured motion (step, unknown) and its covariances (step, unknown, unknown) tell."""
@@ -316,15 +307,34 @@ def _prepared(
     fine = prepare(setup, 1, progress)
     basis, steps = measurement.motion.basis, len(experiment.test)
     amplitude = _filled(measurement, steps).reshape(-1, *basis.shape)
-    rho = residuals(fine.images, basis, amplitude, progress=progress, task="residual")
+    return fine.images.volume, problem_at(setup, fine, basis, amplitude, progress=progress)
+
+
+def problem_at(
+    setup: Setup,
+    fine: Prepared,
+    basis: SectionBasis,
+    amplitude: Floats,
+    *,
+    without_pattern: bool = True,
+    progress: Progress = silent,
+) -> Problem:
+    """Return the problem of the last stage near amplitudes (step, section, motion), voxels.
+
+    The detector's pattern is taken from all images there, if the options say so, unless it is not asked for.
+    """
+    steps = len(amplitude)
     noise = noise_of(setup, fine.systematic)
-    if noise is None:
-        rms, systematic = float(np.sqrt(np.mean(rho**2))), fine.systematic
-        noise = known_from_residual(rms, systematic.shape, systematic.detector, setup.options.smooth_px)
-    elif setup.options.remove_pattern:
-        pattern = fixed_pattern(fine.images, fine.systematic, basis, amplitude, noise, rho)
-        fine = fine.without(pattern.grey)
-        noise = replace(noise, flat=noise.flat * pattern.left)
+    remove = without_pattern and setup.options.remove_pattern
+    if noise is None or remove:
+        rho = residuals(fine.images, basis, amplitude, progress=progress, task="residual")
+        if noise is None:
+            rms, systematic = float(np.sqrt(np.mean(rho**2))), fine.systematic
+            noise = known_from_residual(rms, systematic.shape, systematic.detector, setup.options.smooth_px)
+        else:
+            pattern = fixed_pattern(fine.images, fine.systematic, basis, amplitude, noise, rho)
+            fine = fine.without(pattern.grey)
+            noise = replace(noise, flat=noise.flat * pattern.left)
     known = noise
 
     def at(amplitude: Floats) -> Equations:
@@ -333,17 +343,16 @@ def _prepared(
     def noise_at(amplitude: Floats, _: Equations, slow: Floats) -> Propagated:
         return propagate(fine.images, fine.systematic, basis, amplitude, slow, known, progress=progress)
 
-    problem = Problem(
+    return Problem(
         linearise=at,
         basis=basis,
-        series=experiment.test,
+        series=setup.experiment.test,
         time_functions=np.eye(steps) * np.sqrt(steps),
         start=amplitude / np.sqrt(steps),
         prior=setup.prior(basis),
         noise_rms=fine.noise_rms,
         noise_at=noise_at,
     )
-    return fine.images.volume, problem
 
 
 def profile_from(volume: Volume, basis: SectionBasis, options: IdentifyOptions) -> tuple[Profile, float]:
@@ -363,7 +372,7 @@ def profile_from(volume: Volume, basis: SectionBasis, options: IdentifyOptions) 
 def _integrated(opened: Ready, start: Floats) -> tuple[Identified, Radiographs]:
     """Return what radiographs and force tell, walked again where the motion found is far from where they were."""
     problem, model, force_N = opened.problem, opened.model, opened.force_N
-    radiographs = radiographs_at(problem, opened.spaces(), opened.amplitude)
+    radiographs = radiographs_at(problem, spaces_of(problem), opened.amplitude)
     found = integrated(model, force_N, start, radiographs)
     for _ in range(1, MOST_PASSES):
         if np.sqrt(np.mean((found.amplitude - radiographs.amplitude) ** 2)) < MOVED_VOXEL:
@@ -373,6 +382,14 @@ def _integrated(opened: Ready, start: Floats) -> tuple[Identified, Radiographs]:
         model = carried_by(model, found.amplitude, problem.basis.shape)
         found = integrated(model, force_N, found.estimate.vector, radiographs, found.deviations)
     return found, radiographs
+
+
+def spaces_of(problem: Problem) -> tuple[StateSpace, StateSpace]:
+    """Return the states of whatever moves beside the law, in few modes and in all."""
+    solver, series = Smoother(), problem.series
+    trend, prior = time_basis(solver.trend, series), float(problem.prior.deviation_voxel.max())
+    few, every = (solver.space(problem.basis, series.time_s, trend, prior, modes) for modes in (FITTED_MODES, None))
+    return few, every
 
 
 def _compared(opened: Ready, found: Identified, radiographs: Radiographs) -> dict[str, float]:

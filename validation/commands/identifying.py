@@ -7,12 +7,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from validation.commands.parts import ExperimentFolder, ScenarioName, Threads, Workers, answering, tell, use_threads
+from validation.commands.parts import (
+    ExperimentFolder,
+    ScenarioName,
+    Threads,
+    Workers,
+    answering,
+    read_options,
+    tell,
+    use_threads,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from pdvc.identify.protocol import IdentifyOptions
+    from simulator.scenario import Scenario
 
 Laws = Annotated[
     list[str] | None,
@@ -76,12 +86,11 @@ def identify(
         from pdvc.identify.result import write_identification
         from pdvc.measurement_file import read_measurement
         from pdvc.resumable import measure_into
-        from simulator.truth import read_scenario
         from validation.identify.page import write_page
 
         asked = options_of(IdentifyOptions() if options is None else IdentifyOptions.read(options), law, stroke, until)
         opened = read_experiment(experiment)
-        scenario = read_scenario(experiment) if truth else None
+        scenario = _scenario_of(experiment) if truth else None
         use_threads(threads)
         if measurement is None:
             measured = measure_into(out.with_name(out.stem + "-motion.nc"), opened, progress=progress)
@@ -143,6 +152,41 @@ def identify_draws(
     if failed:
         tell(f"{failed} of {len(table)} draws failed: see {out / 'failed'}")
     tell(f"table: {out / 'recovery.csv'}")
+
+
+def tell_planned_law(scenario: str, law: str, options: str, out: Path | None, threads: int | None) -> None:
+    """Tell how well the parameters of a law would be known of a test that is still to be made."""
+    with answering() as progress:
+        from pdvc.experiment import DESCRIPTION, read_experiment
+        from pdvc.identify.expected import expected_laws
+        from pdvc.identify.laws import law_named
+        from pdvc.identify.protocol import IdentifyOptions
+        from validation.job import write_text
+
+        asked, read, folder = IdentifyOptions(law=law_named(law)), read_options(options), Path(scenario)
+        use_threads(threads)
+        if (folder / DESCRIPTION).is_file():
+            found = expected_laws(read_experiment(folder, planned=True), read, asked, progress=progress)
+        else:
+            from simulator.scenario import load_scenario
+            from validation.identify.planned import plan_law
+
+            found = plan_law(load_scenario(scenario), read, asked, progress=progress)
+        headings = ["force programme", *found[0].deviation]
+        if out is not None:
+            lines = [headings, *([each.programme, *map(str, each.deviation.values())] for each in found)]
+            write_text(out, "".join(",".join(line) + "\n" for line in lines))
+    from rich.console import Console
+
+    rows = [[each.programme, *(f"{100 * value:.2g} %" for value in each.deviation.values())] for each in found]
+    Console().print(_table(headings, rows))
+    tell("standard deviations, relative; of an assumed process beside the law, without errors of the image model")
+
+
+def _scenario_of(folder: Path) -> Scenario:
+    from simulator.truth import read_scenario
+
+    return read_scenario(folder)
 
 
 def options_of(

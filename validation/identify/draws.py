@@ -23,7 +23,7 @@ from pdvc.digest import digest, software
 from pdvc.experiment import Experiment
 from pdvc.identify.crosshead import from_crosshead
 from pdvc.identify.integrated import free_motion, integrated, radiographs_at
-from pdvc.identify.protocol import IdentifyOptions, Ready, ready
+from pdvc.identify.protocol import IdentifyOptions, Ready, ready, spaces_of
 from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, WEIGHTED
 from pdvc.identify.two_step import Estimate
 from pdvc.measurement import Measurement
@@ -33,7 +33,6 @@ from pdvc.options import DEFAULT
 from pdvc.protocol import measure
 from pdvc.state_space import Deviations
 from pdvc.store import read_arrays, write_arrays
-from simulator.loading import Loading
 from simulator.scenario import Scenario
 from validation.batch.engine import Part, Result, Scalar
 from validation.batch.trial import clean_parts, simulated
@@ -41,19 +40,8 @@ from validation.batch.trial import clean_parts, simulated
 Floats = NDArray[np.float64]
 
 METHODS = (INTEGRATED, WEIGHTED, UNWEIGHTED, CROSSHEAD)
-LAW_OF_TRUTH = "ludwik"
 _ROUNDS = 1
 """Times that a draw's deviations are sought, from those of the first."""
-
-
-def truth_of(loading: Loading) -> dict[str, float]:
-    """Return the true parameters of a scenario's law, by the names of `pdvc.identify.laws.Ludwik`."""
-    return {
-        "young_MPa": loading.young_MPa,
-        "yield_MPa": loading.yield_MPa,
-        "hardening_MPa": loading.hardening_MPa,
-        "exponent": loading.hardening_exponent,
-    }
 
 
 @dataclass(frozen=True)
@@ -83,7 +71,7 @@ class First:
             measurement = measure(experiment, DEFAULT, work=folder)
             write_measurement(measurement, folder / "measurement.nc")
             opened = ready(experiment, measurement, self.options, work=folder)
-        radiographs = radiographs_at(opened.problem, opened.spaces(), opened.amplitude)
+        radiographs = radiographs_at(opened.problem, spaces_of(opened.problem), opened.amplitude)
         *_, free = free_motion(radiographs)
         start = opened.two_steps(opened.amplitude, _covariances(measurement, opened))[UNWEIGHTED].vector
         found = integrated(opened.model, opened.force_N, start, radiographs)
@@ -164,7 +152,7 @@ class Draw:
 
         opened = ready(experiment, measurement, self.options)
         noise = Propagated(parts=first["part"], own=first["own"], systematic=first["systematic"])
-        radiographs = radiographs_at(opened.problem, opened.spaces(), opened.amplitude, noise)
+        radiographs = radiographs_at(opened.problem, spaces_of(opened.problem), opened.amplitude, noise)
         note("ready")
         amplitude, covariance, _ = free_motion(radiographs, Deviations(**first["free"]))
         found: dict[str, Estimate] = opened.two_steps(amplitude, covariance, first["vector"])

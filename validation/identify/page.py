@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
 
 from pdvc.identify.laws import Law, Ludwik
 from pdvc.identify.result import Identification
 from pdvc.whole import write_whole
-from simulator.scenario import Scenario
-from validation.identify.draws import truth_of
 from validation.identify.figures import draw_correlation, draw_law, draw_missed
 from validation.identify.tables import (
     compliance_sentence,
@@ -20,8 +19,12 @@ from validation.identify.tables import (
     parameter_rows,
     seen_sentences,
 )
+from validation.identify.truth import truth_of
 from validation.report.figures import new_figure, save
 from validation.report.template import template
+
+if TYPE_CHECKING:
+    from simulator.scenario import Scenario
 
 CAPTIONS = {
     "law": "Flow stress against plastic strain, with the 95 % band of the integrated identification.",

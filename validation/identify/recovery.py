@@ -7,7 +7,8 @@ import pandas as pd
 
 from pdvc.identify.result import CONFIDENT
 from simulator.scenario import Scenario
-from validation.identify.draws import METHODS, truth_of
+from validation.identify.draws import METHODS
+from validation.identify.truth import truth_of
 
 
 def recovery(table: pd.DataFrame, scenario: Scenario) -> pd.DataFrame:
