@@ -6,7 +6,7 @@ from sphinx.application import Sphinx
 
 NAVIGATION = {
     "Start": ["start", "scenarios", "examples"],
-    "How to": ["own-radiographs", "live", "walkthrough", "studies", "methods", "extend", "strategies"],
+    "How to": ["own-radiographs", "live", "walkthrough", "identification", "studies", "methods", "extend", "strategies"],
     "Explanation": [
         "equations",
         "protocol",

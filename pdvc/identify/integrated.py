@@ -136,7 +136,7 @@ def expected_covariance(model: Model, force_N: Floats, radiographs: Radiographs,
         about = _About.at(model, model.unknowns.mean, force_N, force_N, radiographs)
         process = Process(radiographs.spaces[1].with_trend(about.columns), about.seen)
         smoothed = process.smoothed(deviations)
-        return _OfUnknowns(process, about.scale).covariance(smoothed, smoothed.factor.inverted())[0]
+        return np.asarray(_OfUnknowns(process, about.scale).covariance(smoothed, smoothed.factor.inverted())[0])
 
 
 def free_motion(radiographs: Radiographs, deviations: Deviations | None = None) -> tuple[Floats, Floats, Deviations]:
