@@ -97,6 +97,8 @@ class _OfUnknowns(Process):
     def deviation(self, smoothed: Smoothed) -> Floats:
         """Return the posterior standard deviations (unknown,)."""
         variance = np.diag(smoothed.trend_covariance)[-len(self._scale) :]
+        if not (variance > 0).all():
+            raise np.linalg.LinAlgError("unknowns that nothing limits")
         return np.asarray(np.sqrt(variance) * self._scale)
 
     def covariance(self, smoothed: Smoothed, inverse: Blocks) -> Floats:
@@ -121,13 +123,18 @@ def integrated(
     """Return the unknowns of the largest posterior, from a start (unknown,), for the equations of one pass.
 
     The process's deviations are sought in `rounds`, as of a measurement; where some are given, from these, and unless
-    told otherwise in none.
+    told otherwise in none. Raises ValueError where no motion is likely under the law.
     """
     asked = (0 if deviations else ROUNDS) if rounds is None else rounds
-    with one_thread():
-        known = deviations or radiographs.spaces[0].first_guess()
-        settled = _settled(model, force_N, start, radiographs, radiographs.spaces[1], known, asked)
-        return _summed(model, settled, radiographs)
+    known = deviations or radiographs.spaces[0].first_guess()
+    try:
+        with one_thread():
+            settled = _settled(model, force_N, start, radiographs, radiographs.spaces[1], known, asked)
+            return _summed(model, settled, radiographs)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            f"law: expected one under which some motion explains the radiographs, got {model.law.kind}: {error}"
+        ) from None
 
 
 def expected_covariance(model: Model, force_N: Floats, radiographs: Radiographs, deviations: Deviations) -> Floats:

@@ -29,6 +29,7 @@ _NEARBY = 1e-5
 _STARTS_AT, _STARTS_WITH = 0.1, 1.1
 """A law to start from carries a tenth more than the largest stress at a plastic strain of 0.1: one that cannot carry a
 test has no slope that leads to one that can."""
+_LEAST_SLOPE_MPA = 1e-30
 _ROUNDS = 60
 _TABLE = 512
 """Plastic strains at which a law is looked up to bracket a root."""
@@ -205,7 +206,7 @@ def plastic_at(law: Law, stress_MPa: ArrayLike) -> Floats:
         p = np.exp(x)
         left = law.flow_MPa(p) - wanted
         low, high = np.where(left < 0, x, low), np.where(left < 0, high, x)
-        newton = x - left / np.maximum(law.slope_MPa(p) * p, 1e-300)
+        newton = x - left / np.maximum(law.slope_MPa(p) * p, _LEAST_SLOPE_MPA)
         inside = (newton > low) & (newton < high)
         moved = np.where(inside, newton, (low + high) / 2)
         done = np.max(np.abs(moved - x), initial=0.0) < _CLOSE

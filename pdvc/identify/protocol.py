@@ -454,8 +454,8 @@ def _strains(measurement: Measurement, found: Identified, steps: int) -> dict[st
 def _curve(model: Model, estimate: Estimate, force_N: Floats) -> Floats:
     """Return plastic strains up to the largest one, the flow stress there, and the limits of its 95 % band, MPa."""
     _, plastic = model.strains(estimate.vector, force_N)
-    p = np.linspace(0.0, max(float(plastic.max()), 1e-4), POINTS)
-    p[0] = p[1] * 1e-3
+    # denser where it has just yielded, and the first one not quite zero, where slopes may be infinite
+    p = max(float(plastic.max()), 1e-4) * np.linspace(0.01, 1.0, POINTS) ** 2
     rng = np.random.default_rng(0)
     count = model.unknowns.of_law
     draws = rng.multivariate_normal(estimate.vector[:count], estimate.covariance[:count, :count], DRAWS)

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pdvc.identify.result import INTEGRATED, Identification
 
 _PERCENT = 100.0
+FAR = 1000.0
+"""Log evidence beyond which a law is so far off that only this is told of it."""
 
 
 def parameter_rows(found: Identification, truth: Mapping[str, float] | None = None) -> list[list[str]]:
@@ -48,7 +50,7 @@ def evidence_sentence(found: Identification) -> str:
     if not found.log_evidence:
         return "No other law was compared."
     order = sorted(found.log_evidence, key=lambda kind: -found.log_evidence[kind])
-    told = ", ".join(f"{kind} {found.log_evidence[kind]:+.1f}" for kind in order)
+    told = ", ".join(f"{kind} {_short(found.log_evidence[kind])}" for kind in order)
     return f"Log evidence over that of {found.law}: {told}."
 
 
@@ -58,3 +60,7 @@ def compliance_sentence(found: Identification) -> str:
     if math.isnan(value):
         return "The experiment records no stroke: nothing is said of crosshead and machine (--stroke tells its rate)."
     return f"Machine compliance: ({1e4 * value:.3f} ± {1e4 * deviation:.3f}) 1e-4 mm/N, one standard deviation."
+
+
+def _short(log_evidence: float) -> str:
+    return f"under {-FAR:.0f}" if log_evidence < -FAR else f"{log_evidence:+.1f}"
