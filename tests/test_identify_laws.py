@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -166,3 +169,14 @@ def test_bridgmans_correction_lowers_the_strain_of_a_neck_and_of_no_bar():
     np.testing.assert_array_equal(
         strains(OF_SCENARIO, BAR, force, bridgman=True).total, strains(OF_SCENARIO, BAR, force).total
     )
+
+
+def test_the_python_of_the_docs_runs():
+    text = (Path(__file__).parent.parent / "docs" / "identification.md").read_text(encoding="utf-8")
+    names: dict[str, object] = {"__name__": "docs"}
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(compile(block, "identification.md", "exec", dont_inherit=True), names)
+    assert callable(names["law_of"])
+    assert plastic_at(law_named("square-root"), 400.0) == pytest.approx(0.04)
