@@ -134,12 +134,22 @@ class Process:
 
     def response(self, smoothed: Smoothed, deviations: Deviations, noise: Floats) -> Floats:
         """Return what errors of the data y (step, unknown, draw) do to the amplitudes (the same), voxels."""
-        space = self.space
-        vector = smoothed.reduced.of(self._design.transpose(0, 2, 1) / deviations.misfit[:, None, None] @ noise)
+        space, vector = self.space, self._vectors(smoothed, deviations, noise)
         found = smoothed.factor.solved(vector)
-        of_data = np.einsum("tmp,tmd->pd", space.trend - smoothed.held, vector)
-        p = smoothed.trend_covariance @ of_data
+        p = self._trend_response(smoothed, vector)
         return np.asarray(space.to_amplitude @ (found + (space.trend - smoothed.held) @ p))
+
+    def trend_response(self, smoothed: Smoothed, deviations: Deviations, noise: Floats) -> Floats:
+        """Return what errors of the data y (step, unknown, draw) do to the trend p (p, draw)."""
+        return self._trend_response(smoothed, self._vectors(smoothed, deviations, noise))
+
+    def _vectors(self, smoothed: Smoothed, deviations: Deviations, noise: Floats) -> Floats:
+        """Return the right-hand sides (step, state, draw) of errors of the data."""
+        return smoothed.reduced.of(self._design.transpose(0, 2, 1) / deviations.misfit[:, None, None] @ noise)
+
+    def _trend_response(self, smoothed: Smoothed, vector: Floats) -> Floats:
+        of_data = np.einsum("tmp,tmd->pd", self.space.trend - smoothed.held, vector)
+        return np.asarray(smoothed.trend_covariance @ of_data)
 
     def fitted(self, deviations: Deviations, rounds: int = ROUNDS) -> Deviations:
         """Return deviations of the largest marginal likelihood: q, e, n and r, and the scales, in turn."""

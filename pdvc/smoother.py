@@ -67,7 +67,7 @@ EVENT = 25.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Fit:
+class Fitted:
     """The process at one pass: what was seen, and what follows."""
 
     process: Process
@@ -133,7 +133,7 @@ class Smoother(Solver):
         if self.bend_voxel != "fit":
             deviations, rounds = spaces[0].fixed(self.bend_voxel), 0
         for moves in range(self.most_passes + 1):
-            with _one_thread():
+            with one_thread():
                 fit = _fitted(spaces, equations, noise, amplitude, deviations, rounds)
                 wanted, deviation = fit.amplitude, fit.deviation
             deviations, rounds = fit.deviations, 1 if rounds > 1 else 0
@@ -147,11 +147,11 @@ class Smoother(Solver):
                 break
             amplitude, equations = self._carefully(problem, equations, amplitude, wanted)
             rms.append(equations.rms)
-        with _one_thread():
-            known = _known(fit, noise, slow, equations.matrix)
+        with one_thread():
+            known = known_of(fit, noise, slow, equations.matrix)
             if equations.blocks and steps > COHERENT_DEGREE + 2:
                 finer = slow_functions(problem, COHERENT_DEGREE)
-                missed = _of_image_model(fit, finer, equations.blocks, problem.basis.shape) / steps
+                missed = of_image_model(fit, finer, equations.blocks, problem.basis.shape) / steps
                 known = Known(
                     covariance=known.covariance + missed, by_source={**known.by_source, "image model": missed}
                 )
@@ -202,7 +202,7 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _one_thread() -> threadpool_limits:
+def one_thread() -> threadpool_limits:
     """Keep products of small matrices to one thread: two would wait for each other most of the time."""
     return threadpool_limits(limits=1, user_api="blas")
 
@@ -237,7 +237,7 @@ def _fitted(
     amplitude: Floats,
     deviations: Deviations,
     rounds: int,
-) -> _Fit:
+) -> Fitted:
     """Return the likeliest process about amplitudes (step, unknown): found with few modes, then followed with all.
 
     Raises ValueError where none is likely: the radiographs show something else than this sample.
@@ -247,7 +247,7 @@ def _fitted(
         if rounds:
             deviations = Process(spaces[0], data).fitted(deviations, rounds)
         process = Process(spaces[1], data)
-        return _Fit(process=process, deviations=deviations, smoothed=process.smoothed(deviations), white=white)
+        return Fitted(process=process, deviations=deviations, smoothed=process.smoothed(deviations), white=white)
     except np.linalg.LinAlgError as error:
         raise ValueError(
             f"deformation: expected radiographs that some motion of the sample explains, found none that does: {error}"
@@ -259,7 +259,7 @@ def _of_all(noise: Propagated) -> Floats:
     return np.asarray(sum(noise.own.values()))
 
 
-def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
+def known_of(fit: Fitted, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
     """Return the covariance of the amplitudes over the square root of the steps, and what makes it.
 
     `matrix` is B (step, unknown, unknown). What the model of the image misses over many steps is not in it.
@@ -301,7 +301,7 @@ def _known(fit: _Fit, noise: Propagated, slow: Floats, matrix: Floats) -> Known:
     return Known(covariance=own / steps, by_source={name: part / steps for name, part in parts.items()})
 
 
-def _of_image_model(fit: _Fit, slow: Floats, blocks: tuple[BlockVectors, ...], shape: tuple[int, int]) -> Floats:
+def of_image_model(fit: Fitted, slow: Floats, blocks: tuple[BlockVectors, ...], shape: tuple[int, int]) -> Floats:
     """Return the covariance (step, unknown, unknown) of slow errors beyond noise: `pdvc.coherent`."""
     process, design = fit.process, fit.process.seen.design
     turned = design.transpose(0, 2, 1)

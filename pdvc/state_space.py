@@ -132,6 +132,15 @@ class StateSpace:
         part.ends = np.unique([0, len(part.trend) - 1])
         return part
 
+    def with_trend(self, columns: Floats) -> StateSpace:
+        """Return the same with more of a trend: amplitudes (step, unknown, column), each times an unknown number.
+
+        What modes along z cannot make of them, where they are few, is left out.
+        """
+        found = copy(self)
+        found.trend = np.concatenate([self.trend, np.linalg.pinv(self.to_amplitude) @ columns], axis=2)
+        return found
+
     @property
     def shape(self) -> tuple[int, int]:
         """Return (steps, states)."""

@@ -31,6 +31,7 @@ SAYS = {
     "compare": "methods side by side",
     "study": "hundreds of runs",
     "plan": "before the test",
+    "identify": "laws, many draws",
     "batch": "runs on many workers",
     "report": "figures and pages",
     "view": "a test while it runs",

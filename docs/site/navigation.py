@@ -7,8 +7,8 @@ from sphinx.application import Sphinx
 NAVIGATION = {
     "Start": ["start", "scenarios", "scanner", "examples"],
     "How to": [
-        *("own-radiographs", "calibration", "doors", "live", "walkthrough", "studies", "methods", "extend"),
-        "strategies",
+        *("own-radiographs", "calibration", "doors", "live", "walkthrough", "identification", "studies", "methods"),
+        *("extend", "strategies"),
     ],
     "Explanation": [
         "equations",

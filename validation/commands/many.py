@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from validation.commands.identifying import tell_planned_law
 from validation.commands.parts import (
     Options,
     Scheduler,
@@ -158,6 +159,15 @@ def plan(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="CSV", help="Write the designs here, too, as a table.")
     ] = None,
+    law: Annotated[
+        str | None,
+        typer.Option(
+            "--law",
+            metavar="NAME",
+            help="Tell instead how well the parameters of a law would be known: of this test, with unloadings, and "
+            "slower near yield.",
+        ),
+    ] = None,
     threads: Threads = None,
 ) -> None:
     """Tell what to expect of a test before it is made, and which motions it would not show.
@@ -168,8 +178,13 @@ def plan(
     The reference scan is simulated, or that of an experiment folder whose test/radiographs.tif need not be there:
     then `test` in experiment.toml says which angles, times and forces are planned.
 
+    With --law it tells instead how well a law's parameters would be known, for other force programmes, too.
+
     Example:  `pdvc-bench plan quick`
     """
+    if law is not None:
+        tell_planned_law(scenario, law, options, out, threads)
+        return
     with answering() as progress:
         from pdvc.experiment import DESCRIPTION, read_experiment
         from validation.job import write_text

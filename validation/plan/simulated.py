@@ -39,7 +39,7 @@ def plan(
     """
     own = design_of(scenario, options)
     with tempfile.TemporaryDirectory() as name:
-        planner = Planner(_reference_of(scenario, Path(name), progress), options, progress=progress)
+        planner = Planner(reference_of(scenario, Path(name), progress), options, progress=progress)
 
         def test(design: Design) -> PlannedTest:
             return planned(scenario, design, planner.heights_mm)
@@ -63,7 +63,7 @@ def design_of(scenario: Scenario, options: MeasureOptions) -> Design:
     )
 
 
-def _reference_of(scenario: Scenario, folder: Path, progress: Progress) -> Experiment:
+def reference_of(scenario: Scenario, folder: Path, progress: Progress) -> Experiment:
     """Return the reference scan of a scenario, without noise but with the noise that it would have described."""
     simulate(_at_rest(scenario), folder / "experiment", progress=progress)
     detector = scenario.detector

@@ -1,0 +1,1 @@
+"""Identification put to the test: many draws of an experiment whose law is known."""

@@ -1,0 +1,194 @@
+"""One draw of an identification study: other noise of all images and forces, the same sample, motion and law.
+
+The first draw is measured in full (`First`, a part that all draws share), and tells the deviations of the processes
+and the noise of all images. Each draw is then made ready by itself, counts, volume, areas, pattern and pass, at the
+motion that the first one found: the true motion is the same, and what draws differ by is far within what is linear.
+Its own motion, for the two-step methods, is one step of the smoother from there; the integrated identification seeks
+its process's deviations once more, from those of the first.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdvc.digest import digest, software
+from pdvc.experiment import Experiment
+from pdvc.identify.crosshead import from_crosshead
+from pdvc.identify.integrated import free_motion, integrated, radiographs_at
+from pdvc.identify.protocol import IdentifyOptions, Ready, ready, spaces_of
+from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, WEIGHTED
+from pdvc.identify.two_step import Estimate
+from pdvc.measurement import Measurement
+from pdvc.measurement_file import read_measurement, write_measurement
+from pdvc.noise import Propagated
+from pdvc.options import DEFAULT
+from pdvc.protocol import measure
+from pdvc.state_space import Deviations
+from pdvc.store import read_arrays, write_arrays
+from simulator.scenario import Scenario
+from validation.batch.engine import Part, Result, Scalar
+from validation.batch.trial import clean_parts, simulated
+
+Floats = NDArray[np.float64]
+
+METHODS = (INTEGRATED, WEIGHTED, UNWEIGHTED, CROSSHEAD)
+_ROUNDS = 1
+"""Times that a draw's deviations are sought, from those of the first."""
+
+
+@dataclass(frozen=True)
+class First:
+    """The first draw, measured and identified in full, in the shared folder; a `validation.batch.engine.Part`."""
+
+    scenario: Scenario
+    options: IdentifyOptions
+
+    @cached_property
+    def name(self) -> str:
+        """Return its folder in the shared folder: a digest of what it depends on."""
+        first = self.scenario.model_copy(update={"repetition": 0})
+        return f"first-{digest(first.model_dump_json(), self.options, software('pdvc', 'simulator', 'validation'))}"
+
+    def needs(self) -> tuple[Part, ...]:
+        """Return the clean stacks from which the counts are made."""
+        return clean_parts(self.scenario)
+
+    def make(self, shared: Path) -> None:
+        """Simulate, measure, and find the processes with and without the law, unless that is there."""
+        folder = shared / self.name
+        if read_arrays(folder / "known.kept") is not None:
+            return
+        first = self.scenario.model_copy(update={"repetition": 0})
+        with simulated(first, shared) as (experiment, _, _):
+            measurement = measure(experiment, DEFAULT, work=folder)
+            write_measurement(measurement, folder / "measurement.nc")
+            opened = ready(experiment, measurement, self.options, work=folder)
+        radiographs = radiographs_at(opened.problem, spaces_of(opened.problem), opened.amplitude)
+        *_, free = free_motion(radiographs)
+        start = opened.two_steps(opened.amplitude, _covariances(measurement, opened))[UNWEIGHTED].vector
+        found = integrated(opened.model, opened.force_N, start, radiographs)
+        arrays: dict[str, NDArray[Any]] = {"vector": found.estimate.vector, "systematic": radiographs.noise.systematic}
+        for group, values in (
+            ("free", vars(free)),
+            ("law", vars(found.deviations)),
+            ("own", radiographs.noise.own),
+            ("part", radiographs.noise.parts),
+        ):
+            arrays |= {f"{group}:{name}": value for name, value in values.items()}
+        write_arrays(folder / "known.kept", arrays)
+
+    def read(self, shared: Path) -> tuple[Measurement, dict[str, Any]]:
+        """Return its measurement, and what else was found, by groups."""
+        self.make(shared)
+        kept = read_arrays(shared / self.name / "known.kept")
+        assert kept is not None, "it was made"
+        groups: dict[str, Any] = {"free": {}, "law": {}, "own": {}, "part": {}}
+        for name, value in kept.items():
+            group, _, rest = name.partition(":")
+            if rest:
+                groups[group][rest] = value
+            else:
+                groups[name] = value
+        return read_measurement(shared / self.name / "measurement.nc"), groups
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draw:
+    """One draw of a scenario whose law is identified; a `validation.batch.engine.Run`."""
+
+    scenario: Scenario
+    options: IdentifyOptions
+
+    @cached_property
+    def key(self) -> str:
+        """Return a digest of all that the result depends on."""
+        return digest(
+            self.scenario.model_dump_json(exclude={"name", "title", "material"}),
+            self.options,
+            software("pdvc", "simulator", "validation"),
+        )
+
+    @property
+    def columns(self) -> Mapping[str, Scalar]:
+        """Return what says which run this is."""
+        return {"scenario": self.scenario.name, "law": self.options.law.kind, "repetition": self.scenario.repetition}
+
+    @property
+    def score_columns(self) -> Mapping[str, type]:
+        """Return names and types of the scores."""
+        names = tuple(self.options.law.values())
+        return {
+            f"{method}:{name}{what}": float for method in METHODS for name in names for what in ("", "_deviation")
+        } | {"area_error": float, **{f"seconds_{method}": float for method in (*METHODS, "ready")}}
+
+    def parts(self) -> tuple[Part, ...]:
+        """Return the clean stacks, and the first draw."""
+        return *clean_parts(self.scenario), First(self.scenario, self.options)
+
+    def carry_out(self, shared: Path) -> Result:
+        """Simulate, make ready and identify by every method; logarithms and their deviations are the scores."""
+        measurement, first = First(self.scenario, self.options).read(shared)
+        with simulated(self.scenario, shared) as (experiment, _, _):
+            return Result(scores=self._identified(experiment, measurement, first))
+
+    def _identified(
+        self, experiment: Experiment, measurement: Measurement, first: dict[str, Any]
+    ) -> dict[str, Scalar]:
+        took: dict[str, float] = {}
+        clock = time.perf_counter()
+
+        def note(part: str) -> None:
+            nonlocal clock
+            now = time.perf_counter()
+            took[part], clock = now - clock, now
+
+        opened = ready(experiment, measurement, self.options)
+        noise = Propagated(parts=first["part"], own=first["own"], systematic=first["systematic"])
+        radiographs = radiographs_at(opened.problem, spaces_of(opened.problem), opened.amplitude, noise)
+        note("ready")
+        amplitude, covariance, _ = free_motion(radiographs, Deviations(**first["free"]))
+        found: dict[str, Estimate] = opened.two_steps(amplitude, covariance, first["vector"])
+        note(UNWEIGHTED)
+        took[WEIGHTED] = took[UNWEIGHTED]
+        if opened.stroke_mm is not None:
+            found[CROSSHEAD] = from_crosshead(
+                opened.model, opened.force_N, opened.stroke_mm, opened.loaded, first["vector"]
+            )
+            note(CROSSHEAD)
+        known = Deviations(**first["law"])
+        law = integrated(opened.model, opened.force_N, first["vector"], radiographs, known, _ROUNDS)
+        found[INTEGRATED] = law.estimate
+        note(INTEGRATED)
+        scores: dict[str, Scalar] = {f"seconds_{part}": seconds for part, seconds in took.items()}
+        for method, estimate in found.items():
+            deviation = np.sqrt(np.diag(estimate.covariance))
+            for k, name in enumerate(opened.model.unknowns.names[: opened.model.unknowns.of_law]):
+                scores[f"{method}:{name}"] = float(estimate.vector[k])
+                scores[f"{method}:{name}_deviation"] = float(deviation[k])
+        scores["area_error"] = self._area_error(opened)
+        return scores
+
+    def _area_error(self, opened: Ready) -> float:
+        """Return by what share the smallest section was found too large."""
+        from simulator.specimen import area_mm2
+
+        true = float(area_mm2(self.scenario.specimen, 0.0))
+        return float(opened.model.profile.area_mm2.min() / true - 1)
+
+
+def draws(scenario: Scenario, options: IdentifyOptions, count: int) -> list[Draw]:
+    """Return draws of a scenario, their noise numbered from 1; the crosshead's rate is told."""
+    told = options.model_copy(update={"stroke_mm_per_s": scenario.loading.stroke_mm_per_s})
+    return [Draw(scenario=scenario.model_copy(update={"repetition": n}), options=told) for n in range(1, count + 1)]
+
+
+def _covariances(measurement: Measurement, opened: Ready) -> Floats:
+    return np.stack([measurement.motion.step_covariance(t) for t in range(len(opened.force_N))])
