@@ -16,9 +16,9 @@ to 1/2 over the turn) and of a bend (t^2) there are left, by their Fourier serie
 
     1 - 6 / pi^2 = 0.63^2      and      1 - 90 / pi^4 = 0.28^2
 
-to the right, and nearly all downwards. What is seen to a share under `LEAST_SEEN` is left as told, and said. Motion
-that is not told from zero by `TOLD` deviations is left, too: errors that the volume makes otherwise, by interpolation
-and by its few views, would pass for it.
+to the right, and nearly all downwards (waves of two periods less, as opposite views agree on them). What is seen to a
+share under `LEAST_SEEN` is left as told, and said. Motion that is not told from zero by `TOLD` deviations is left,
+too: errors that the volume makes otherwise, by interpolation and by its few views, would pass for it.
 
 Standard deviations come from blocks of pixels that err independently of each other, as in `pdvc.coherent`.
 """

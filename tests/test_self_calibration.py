@@ -117,7 +117,9 @@ def test_the_share_that_is_seen_is_that_of_the_closed_form():
         assert seen[f"{direction} cos 2"] == pytest.approx(1, abs=0.06)
     assert seen["column_shift"] == pytest.approx(1, abs=0.1)
     assert seen["roll"] == pytest.approx(1, abs=0.1)
-    assert min(share for name, share in seen.items() if name.startswith("down")) > 0.8
+    assert min(seen[f"down {mode}"] for mode in ("drift", "bend", "cos", "sin")) > 0.8
+    # opposite views agree on these: only how narrow the sample is shows them
+    assert 0.4 < min(seen[f"down {mode}"] for mode in ("cos 2", "sin 2")) < 0.8
     assert max(seen[name] for name in UNSEEN) < LEAST_SEEN
 
 
