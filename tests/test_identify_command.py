@@ -113,3 +113,12 @@ def test_a_plan_tells_deviations_for_other_force_programmes(measured, tmp_path):
     assert [line.split(",")[0] for line in lines[1:]] == ["as planned", "2 unloadings", "slower near yield"]
     numbers = np.array([line.split(",")[1:] for line in lines[1:]], dtype=float)
     assert ((numbers > 1e-3) & (numbers < 1.01)).all()
+
+
+def test_options_written_as_toml_are_read_again_and_a_law_to_compare_that_is_none_is_refused_first(measured, tmp_path):
+    path = tmp_path / "identify.toml"
+    path.write_text(IdentifyOptions().template(), encoding="utf-8")
+    assert IdentifyOptions.read(path) == IdentifyOptions()
+    opened, motion = read_experiment(measured / "experiment"), read_measurement(measured / "motion.nc")
+    with pytest.raises(ValueError, match=r"law: expected one of .*, got 'hooke'"):
+        identify(opened, motion, IdentifyOptions(compare=("hooke",)))

@@ -139,6 +139,8 @@ def ready(
     Raises ValueError as `identify` does.
     """
     _check(experiment, measurement)
+    for kind in options.compare:
+        law_named(kind)  # before anything is computed
     steps = len(experiment.test) if options.until is None else min(options.until, len(experiment.test))
     used = _first_steps(experiment, steps)
     if np.ptp(used.test.force_N) == 0:
