@@ -17,10 +17,12 @@ from benchmarks import rtk, stored
 from benchmarks.case import Case, amplitude, case
 from benchmarks.timing import Seconds, in_turns, machine, once, with_threads
 from pdvc.experiment import read_experiment
+from pdvc.noise import ImageNoise, StepNoise
 from pdvc.options import MeasureOptions
-from pdvc.projection import normal_equations
+from pdvc.projection import normal_equations, sensitivities
 from pdvc.protocol import measure
 from pdvc.reconstruction import fdk
+from pdvc.sensitivity_sums import Spread
 from simulator.images import prepare
 from simulator.radiography import path_lengths
 from simulator.scanner import simulate
@@ -82,6 +84,7 @@ def main() -> None:
     full = case("jailin2018")
     _radiograph(rows, full, options.repeats)
     _reconstruction(rows, full, 600 if options.full else options.views)
+    _noise(rows, full, options.repeats)
     _stored(rows)
     _simulation(rows)
     _measurement(rows)
@@ -149,6 +152,34 @@ def _reconstruction(rows: Rows, full: Case, count: int) -> None:
         other, note = "RTK FDK, whole box", f"rms {apart:.1e} of the sample's mean, in the hull"
     size = f"{count} views, {' x '.join(str(n) for n in grid.shape)} voxels"
     rows.add("FDK", size, 2, seconds, other, its, note)
+
+
+def _noise(rows: Rows, full: Case, repeats: int) -> None:
+    """Time what noise of a radiograph, its views and the flats does to one step, beside the step's equations."""
+    window, volume, voxel = full.window, full.volume, full.volume.grid.voxel_mm
+    shape, detector = (window.rows, window.columns), (full.geometry.rows, full.geometry.columns)
+    basis, rays = full.basis(29, 7), full.rays(window, ANGLE_RAD)
+    trial, blank = amplitude(basis, 3.0)[None], np.zeros((1, *shape), np.float32)
+    (field,) = sensitivities(volume, rays, shape, basis, trial, voxel_mm=voxel)
+    # moved down and to the right, the less the farther up
+    row, column = np.indices(shape)
+    places = np.stack(
+        [1.005 * row + full.corner[0] - 3.3, column + full.corner[1] + 2.7 + 1e-3 * row, 1 + 0 * row], -1
+    )
+    image, view = (
+        ImageNoise(variance=np.ones(s, np.float32), slope=np.ones(s, np.float32)) for s in (shape, detector)
+    )
+
+    def noise() -> Any:
+        spread = Spread(weighted=field, places=places, corner=full.corner, shape=detector)
+        return StepNoise(image=image, view=view, spread=spread).own(view.variance, trial.size)
+
+    def equations() -> Any:
+        return normal_equations(volume, rays, basis, trial, blank, np.ones_like(blank), voxel_mm=voxel)
+
+    taken, its = in_turns([with_threads(1, noise), with_threads(1, equations)], repeats)
+    size = f"{window.rows} x {window.columns} px, used window"
+    rows.add("noise of a step, 29 sections x 7 motions", size, 1, taken, "equations", its)
 
 
 def _stored(rows: Rows) -> None:
