@@ -6,7 +6,16 @@ from sphinx.application import Sphinx
 
 NAVIGATION = {
     "Start": ["start", "scenarios", "examples"],
-    "How to": ["own-radiographs", "live", "walkthrough", "identification", "studies", "methods", "extend", "strategies"],
+    "How to": [
+        "own-radiographs",
+        "live",
+        "walkthrough",
+        "identification",
+        "studies",
+        "methods",
+        "extend",
+        "strategies",
+    ],
     "Explanation": [
         "equations",
         "protocol",
