@@ -11,7 +11,7 @@ from pdvc.geometry import ConeBeam
 from pdvc.likeness import neighbouring_views
 from pdvc.rays import ray_vectors
 from pdvc.sections import CONTRACTION, RIGID, SectionBasis
-from pdvc.systematic import Systematic, _cubic, taps, turned_rad, views_around
+from pdvc.systematic import KNOT, Systematic, _cubic, taps, turned_rad, views_around
 from tests.laws import law
 
 SCANNER = ConeBeam(source_axis_mm=200.0, source_detector_mm=2000.0, pixel_mm=0.5, rows=40, columns=30, roll_rad=0.0)
