@@ -67,7 +67,7 @@ def doubts_of_spots(spots: Sequence[Spot]) -> tuple[Doubt, ...]:
             name="crack",
             figure=f"from step {over[0]} on the residual shows less material than before at x = {x:.2f}, y = {y:.2f}, "
             f"z = {z:.2f} mm, by {most.score:.0f} deviations",
-            advice="a crack, a void, or a neck narrower than the sections, which they do not follow: look at the residual",
+            advice="a crack, a void, or a neck narrower than sections, which they do not follow: look at the residual",
             steps=tuple(over),
         ),
     )

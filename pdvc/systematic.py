@@ -40,7 +40,9 @@ Image = NDArray[np.float32]
 REACH = 3.0
 """Standard deviations from which on a view takes no part in a mean over views."""
 KNOT = 16
-"""Pixels of a row from one place that is worked out to the next: in between a moved row bends by 1e-3 pixel."""
+"""Pixels of a row from one place that is worked out to the next: in between a moved row hardly bends."""
+BENT_PX = 5e-4
+"""Pixels by which it may."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,7 +303,8 @@ def _panel(rays):  # type: ignore[no-untyped-def]
 def _along_row(rays, turn, panel, heights, maps, corner, row, place):  # type: ignore[no-untyped-def]
     """Write the places of the pixels of a row, `place` (row, column and factor; column).
 
-    Worked out at every `KNOT`-th pixel, and linear in between.
+    Worked out at every `KNOT`-th pixel, and linear in between, but where that is not right by `BENT_PX`: where another
+    section begins, it is twice as far off at most.
     """
     normal, depth, per_pitch2 = panel
     last = place.shape[1] - 1
@@ -309,14 +312,21 @@ def _along_row(rays, turn, panel, heights, maps, corner, row, place):  # type: i
     place[0, 0], place[1, 0], place[2, 0] = r, c, longer
     for start in range(0, last, KNOT):
         end = min(start + KNOT, last)
+        middle = (start + end) // 2
+        rm, cm, _, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, middle, k)
         r1, c1, longer1, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, end, k)
         per_pixel = 1 / (end - start)
+        share = (middle - start) * per_pixel
+        bent = max(abs(rm - r - share * (r1 - r)), abs(cm - c - share * (c1 - c))) > BENT_PX
         for n in range(1, end - start + 1):
             share = n * per_pixel
             place[0, start + n] = r + share * (r1 - r)
             place[1, start + n] = c + share * (c1 - c)
             place[2, start + n] = longer + share * (longer1 - longer)
         r, c, longer = r1, c1, longer1
+        for column in range(start + 1, end if bent else start):
+            rm, cm, lm, k = _place(rays, turn, normal, depth, per_pitch2, heights, maps, corner, row, column, k)
+            place[0, column], place[1, column], place[2, column] = rm, cm, lm
 
 
 @apart(boundscheck=False)
