@@ -22,7 +22,7 @@ from simulator.kinematics import rotation_matrix
 from simulator.misalignment import Misalignment
 from simulator.radiography import Body
 from simulator.sample import placed
-from simulator.stage import Stage
+from simulator.stage import RotationStage
 
 Floats = NDArray[np.float64]
 COLUMN, ROW = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
@@ -92,7 +92,7 @@ class Aligner:
 
     recorded: ConeBeam
     misalignment: Misalignment = field(default_factory=Misalignment)
-    stage: Stage = field(default_factory=Stage)
+    stage: RotationStage = field(default_factory=RotationStage)
     spot: FocalSpot = field(default_factory=FocalSpot)
 
     @property

@@ -12,13 +12,13 @@ from simulator.lag import Lag
 from simulator.open_beam import OpenBeam
 from simulator.panel import Panel
 from simulator.scatter import Scatter
-from simulator.stage import Stage
+from simulator.stage import RotationStage
 
 
 class Imperfections(Settings):
     """What a real scanner does beside making images."""
 
-    stage: Stage = Stage()
+    stage: RotationStage = RotationStage()
     """the rotation stage"""
     focal_spot: FocalSpot = FocalSpot()
     """size and drift of the focal spot"""

@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
-class Stage(Settings):
+class RotationStage(Settings):
     """The rotation stage, in the reference scan, the test, and interrupted scans; perfect by default."""
 
     angle_jitter_deg: NotNegative = 0.0

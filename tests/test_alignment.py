@@ -14,7 +14,7 @@ from simulator.alignment import Aligner, Moment
 from simulator.focal_spot import FocalSpot
 from simulator.misalignment import Misalignment
 from simulator.radiography import Body, path_lengths
-from simulator.stage import Stage
+from simulator.stage import RotationStage
 from tests.laws import law
 
 SCANNER = ConeBeam(source_axis_mm=30.0, source_detector_mm=300.0, pixel_mm=0.5, rows=60, columns=44)
@@ -70,7 +70,7 @@ def aligners(draw):
         axis_across_mm=draw(small) / 20,
         **degrees,
     )
-    stage = Stage(
+    stage = RotationStage(
         angle_error_deg=draw(small), wobble_deg=abs(draw(small)), runout_mm=abs(draw(small)) / 50, lift_mm=0.05
     )
     drift = tuple(draw(small) / 20 for _ in range(3))
@@ -149,7 +149,7 @@ def test_a_scanner_that_is_not_misaligned_sees_what_a_cone_beam_tells():
         {"misalignment": Misalignment(tilt_deg=0.1)},
         {"misalignment": Misalignment(slant_deg=0.1)},
         {"misalignment": Misalignment(axis_across_mm=0.1)},
-        *({"stage": Stage(**{key: 0.1})} for key in Stage.model_fields if key != "wobbles_per_turn"),
+        *({"stage": RotationStage(**{key: 0.1})} for key in RotationStage.model_fields if key != "wobbles_per_turn"),
         *({"spot": FocalSpot(drift_mm=tuple(0.1 * np.eye(3)[n]))} for n in range(3)),
     ],
 )
@@ -209,7 +209,7 @@ def test_wrong_distances_are_a_wrong_magnification():
 
 
 def test_jitter_displaces_by_the_radius_and_backlash_turns_the_test_alone():
-    stage = Stage(angle_jitter_deg=0.05, backlash_deg=0.3, shake_mm=0.002)
+    stage = RotationStage(angle_jitter_deg=0.05, backlash_deg=0.3, shake_mm=0.002)
     rng = np.random.default_rng(0)
     drawn = [stage.drawn(rng, in_test=False) for _ in range(4000)]
     aligner = Aligner(recorded=SCANNER, stage=stage)
@@ -226,7 +226,7 @@ def test_jitter_displaces_by_the_radius_and_backlash_turns_the_test_alone():
 
 
 def test_an_encoder_off_its_centre_errs_by_a_sine_of_the_angle():
-    aligner = Aligner(recorded=SCANNER, stage=Stage(angle_error_deg=0.2))
+    aligner = Aligner(recorded=SCANNER, stage=RotationStage(angle_error_deg=0.2))
     for angle in np.linspace(0, 7, 15):
         x, y, _ = aligner.at(angle, STILL).turn @ [1, 0, 0]
         assert np.arctan2(y, x) == pytest.approx(
@@ -235,7 +235,7 @@ def test_an_encoder_off_its_centre_errs_by_a_sine_of_the_angle():
 
 
 def test_a_wobble_displaces_by_the_height_and_goes_round_twice_a_turn():
-    aligner = Aligner(recorded=SCANNER, stage=Stage(wobble_deg=0.1, runout_mm=0.003, lift_mm=0.001))
+    aligner = Aligner(recorded=SCANNER, stage=RotationStage(wobble_deg=0.1, runout_mm=0.003, lift_mm=0.001))
     angles = np.linspace(0, 2 * np.pi, 9)
     top = np.array([aligner.at(a, STILL).turn @ [0, 0, 5.0] - [0, 0, 5.0] for a in angles])
     np.testing.assert_allclose(np.hypot(*top.T[:2]), 5 * np.deg2rad(0.1), rtol=1e-5)
@@ -248,7 +248,7 @@ def test_a_wobble_displaces_by_the_height_and_goes_round_twice_a_turn():
 
 
 def test_a_wobble_once_a_turn_is_another_way_to_mount_the_sample():
-    aligner = Aligner(recorded=SCANNER, stage=Stage(wobble_deg=1.0, wobbles_per_turn=1))
+    aligner = Aligner(recorded=SCANNER, stage=RotationStage(wobble_deg=1.0, wobbles_per_turn=1))
     mounted = aligner.at(0.0, STILL).turn
     for angle in (0.5, 2.0, 4.0):
         plain = Rotation.from_euler("z", angle).as_matrix()
