@@ -35,6 +35,7 @@ SAYS = {
     "batch": "runs on many workers",
     "report": "figures and pages",
     "view": "a test while it runs",
+    "doors": "other programs' files",
     "methods": "what can be compared",
     "scoring": "errors, intervals, bound",
     "testing": "laws of one's own",
