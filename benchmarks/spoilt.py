@@ -36,7 +36,7 @@ def wandering_beam(experiment: Experiment, share: float) -> dict[str, Counts]:
 def moved_views(experiment: Experiment, motion_px: dict[str, float]) -> dict[str, Counts]:
     """Return reference views that moved, by `motion_px` as in `pdvc.correction`."""
     series, calibration = experiment.reference, calibrate(experiment)
-    way = view_motion(motion_px, series)
+    way = view_motion(motion_px, series.angle_rad, series.time_s)
     views = [moved_back(grey_levels(counts, calibration), -px) for counts, px in zip(series.counts, way, strict=True)]
     counts = calibration.dark + calibration.open_beam * np.exp(-np.stack(views))
     return {REFERENCE: np.rint(counts).clip(0, 65535).astype(np.uint16)}

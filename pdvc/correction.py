@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pdvc.experiment import Series
 from pdvc.geometry import ConeBeam
 
 Floats = NDArray[np.float64]
@@ -114,22 +113,21 @@ def corrected(told: ConeBeam, values_px: Mapping[str, float]) -> ConeBeam:
     )
 
 
-def view_motion(values_px: Mapping[str, float], series: Series) -> Floats:
-    """Return how each view of a series moved (view, 3), along `DIRECTIONS`, px, by `values_px` of `MOTION`."""
-    modes = modes_of(series)
-    result = np.zeros((len(series), len(DIRECTIONS)))
+def view_motion(values_px: Mapping[str, float], angle_rad: Floats, time_s: Floats) -> Floats:
+    """Return how views at angles and times (view,) moved (view, 3), along `DIRECTIONS`, px, by values of `MOTION`."""
+    modes = modes_of(angle_rad, time_s)
+    result = np.zeros((len(time_s), len(DIRECTIONS)))
     for name in MOTION:
         direction, mode = name.split(" ", maxsplit=1)
         result[:, DIRECTIONS.index(direction)] += values_px.get(name, 0.0) * modes[mode]
     return result
 
 
-def modes_of(series: Series) -> dict[str, Floats]:
+def modes_of(angle_rad: Floats, time_s: Floats) -> dict[str, Floats]:
     """Return each of `MODES` (view,): a drift by one from first to last, a bend of mean zero, and waves of one."""
-    theta = series.angle_rad
-    time = series.time_s if np.ptp(series.time_s) > 0 else np.arange(len(series), dtype=float)
+    time = time_s if np.ptp(time_s) > 0 else np.arange(len(time_s), dtype=float)
     t = (time - time.min()) / max(float(np.ptp(time)), 1e-300) - 0.5
-    waves = (np.cos(theta), np.sin(theta), np.cos(2 * theta), np.sin(2 * theta))
+    waves = (np.cos(angle_rad), np.sin(angle_rad), np.cos(2 * angle_rad), np.sin(2 * angle_rad))
     return dict(zip(MODES, (t, 6 * t**2 - 0.5, *waves), strict=True))
 
 

@@ -44,7 +44,6 @@ from pdvc.window import reached_rows, scan_grid
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-_HULL_MARGIN_VOXEL = 3.0
 _VIEWS_AT_HAND = 16
 """Reference views whose noise is kept: steps that follow each other look along some of the same."""
 
@@ -247,7 +246,7 @@ def scan_volume(
         return {"F": fdk(seen, geometry, series.angle_rad[chosen], grid, hull, progress=progress, task=task)}
 
     values = keep(reconstructed)["F"]
-    reached = hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm)
+    reached = hull.around_voxels(geometry.voxel_mm)
     phase = phase_correction(values) if care.sharpen else 0.0
     return Volume(values=values, grid=grid, hull=reached, phase=phase)
 

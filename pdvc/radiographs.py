@@ -141,9 +141,8 @@ def grey_noise(counts: NDArray[np.uint16], calibration: Calibration, noise: Dete
     slope = c1 + attenuation * (2 * c2 + 3 * c3 * attenuation)
     variance = slope**2 * noise.relative_variance(signal)
     # a dead pixel's counts tell neither: its neighbours' mean stands for both, as for its grey level
-    return fill(np.asarray(variance, dtype=np.float32), calibration.bad), fill(
-        np.asarray(slope, dtype=np.float32), calibration.bad
-    )
+    of_noise, of_beam = (fill(np.asarray(each, dtype=np.float32), calibration.bad) for each in (variance, slope))
+    return of_noise, of_beam
 
 
 def fill(image: Image, bad: NDArray[np.bool_]) -> Image:

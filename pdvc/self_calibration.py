@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numba
@@ -83,7 +83,6 @@ BLOCKS = 8
 RENEWED_PX = 0.2
 """Change of a round from which on sensitivities are found anew in the next."""
 _MARGIN_ROWS = 2
-_HULL_MARGIN_VOXEL = 3.0
 
 
 def self_calibrated(
@@ -156,13 +155,7 @@ class _Scan:
     def __init__(self, series: Series, told: ConeBeam, calibration: Calibration, hull: Hull, scale: int) -> None:
         chosen = one_of(series.angle_rad, max(scale // 2, 1))
         self._told, self._hull, self._scale = told, hull, scale
-        self._series = replace(
-            series,
-            counts=series.counts[chosen],
-            angle_rad=series.angle_rad[chosen],
-            time_s=series.time_s[chosen],
-            force_N=series.force_N[chosen],
-        )
+        self._angle_rad, self._time_s = series.angle_rad[chosen], series.time_s[chosen]
 
         def view(i: int) -> Image:
             seen = coarsened(grey_levels(series.counts[i], calibration), scale)
@@ -178,7 +171,7 @@ class _Scan:
 
     def views(self, values: Mapping[str, float]) -> Image:
         """Return the views (view, row, column) moved back."""
-        way = view_motion(values, self._series)
+        way = view_motion(values, self._angle_rad, self._time_s)
         if not way.any():
             return self._views
         with ThreadPoolExecutor(numba.get_num_threads()) as pool:
@@ -186,12 +179,12 @@ class _Scan:
 
     def left(self, values: Mapping[str, float]) -> Image:
         """Return e (view, row, column), grey levels, of the rows whose rays stay in the volume."""
-        views, angle = self.views(values), self._series.angle_rad
+        views, angle = self.views(values), self._angle_rad
         geometry = corrected(self._told, values).binned(self._scale)
         volume = Volume(
             values=fdk(lambda i: sharpened(views[i]), geometry, angle, self._grid, self._hull),
             grid=self._grid,
-            hull=self._hull.grown(_HULL_MARGIN_VOXEL * geometry.voxel_mm),
+            hull=self._hull.around_voxels(geometry.voxel_mm),
         )
         again = project_at_rest(volume, ray_vectors(geometry, angle).stacked(), views[0].shape)
         return np.asarray((again - views)[:, self._rows])
@@ -208,11 +201,18 @@ class _Scan:
     def shares(self, values: Mapping[str, float], names: Sequence[str], changes: Image) -> dict[str, float]:
         """Return |J| / |G| of each parameter: what the volume cannot take up of what it does to the views."""
         step, here = STEP_PX * self._scale, self.views(values)
-        direct = (_moved_flat(here, name, step, self._series, self._scale) - here for name in names)
+        direct = (self._moved_flat(here, name, step) - here for name in names)
         return {
             name: _rms(change) / max(_rms(by_itself[:, self._rows] / step), 1e-30)
             for name, change, by_itself in zip(names, changes, direct, strict=True)
         }
+
+    def _moved_flat(self, views: Image, name: str, step_px: float) -> Image:
+        """Return views that a parameter has moved by a step, as if the sample were flat, in the plane of the axis."""
+        way = view_motion({name: step_px}, self._angle_rad, self._time_s)
+        if name in GEOMETRY:
+            way[:, DIRECTIONS.index(GEOMETRY[name])] = step_px
+        return np.stack([moved_back(view, px, self._scale) for view, px in zip(views, way, strict=True)])
 
     def settled(
         self, start: Mapping[str, float], names: Sequence[str], progress: Progress, changes: Image | None = None
@@ -254,14 +254,6 @@ def _change(changes: Image, e: Image, now: Floats, deviation: Floats) -> tuple[F
     inverse = np.linalg.inv(matrix + ridge)
     std = np.sqrt(np.diag(inverse @ (covariance + variance * ridge) @ inverse))
     return -inverse @ (gradient + ridge @ now), std
-
-
-def _moved_flat(views: Image, name: str, step_px: float, series: Series, scale: int) -> Image:
-    """Return views that a parameter has moved by a step, as if the sample were flat, in the plane of the axis."""
-    way = view_motion({name: step_px}, series)
-    if name in GEOMETRY:
-        way[:, DIRECTIONS.index(GEOMETRY[name])] = step_px
-    return np.stack([moved_back(view, px, scale) for view, px in zip(views, way, strict=True)])
 
 
 def _rms(image: Image) -> float:

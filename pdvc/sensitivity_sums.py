@@ -60,8 +60,8 @@ class Rows:
 
     def add_product(self, other: Rows, variance: Image, out: Floats) -> None:
         """Add sum_p self(p)^T v(p) other(p) to `out` (unknown, unknown): with itself, its lower triangle."""
-        starts = (np.full(len(self.values), each.first) for each in (self, other))
-        _add_product(self.values, next(starts), other.values, next(starts), variance, self is other, out)
+        starts, others = (np.full(len(self.values), each.first) for each in (self, other))
+        _add_product(self.values, starts, other.values, others, variance, self is other, out)
 
 
 @dataclass(frozen=True, kw_only=True)

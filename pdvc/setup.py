@@ -73,7 +73,8 @@ class Setup:
         """Return how each reference view moved (view, 3), px, as in `pdvc.correction`; None where none did."""
         if self.correction is None:
             return None
-        found = view_motion(self.correction.values_px, self.experiment.reference)
+        views = self.experiment.reference
+        found = view_motion(self.correction.values_px, views.angle_rad, views.time_s)
         return found if found.any() else None
 
     def recording(self) -> Recording:

@@ -118,12 +118,7 @@ class Smoother(Solver):
             raise ValueError("solver: expected kind = 'smoother' in the last stage, at scale 1, got it in another one")
         steps, shape = len(problem.series), problem.start.shape[1:]
         amplitude = problem.start.reshape(steps, -1) * np.sqrt(steps)
-        trend = time_basis(self.trend, problem.series) if self.trend else np.empty((0, steps))
-        prior = float(problem.prior.deviation_voxel.max())
-        few, all_modes = (
-            self.space(problem.basis, problem.series.time_s, trend, prior, modes) for modes in (FITTED_MODES, None)
-        )
-        spaces = few, all_modes
+        spaces = self.spaces(problem)
         equations = problem.linearise(amplitude.reshape(steps, *shape))
         slow = slow_functions(problem)
         noise = problem.noise_at(amplitude.reshape(steps, *shape), equations, slow)
@@ -171,6 +166,13 @@ class Smoother(Solver):
     def passes(self) -> float:
         """Return about how many passes over all radiographs it may take."""
         return self.most_passes * 0.6 + 3
+
+    def spaces(self, problem: Problem) -> tuple[StateSpace, StateSpace]:
+        """Return the states of a problem's steps: with the few modes in which deviations are found, and with all."""
+        series, prior = problem.series, float(problem.prior.deviation_voxel.max())
+        trend = time_basis(self.trend, series) if self.trend else np.empty((0, len(series)))
+        few, every = (self.space(problem.basis, series.time_s, trend, prior, modes) for modes in (FITTED_MODES, None))
+        return few, every
 
     def space(
         self, basis: SectionBasis, time_s: Floats, trend: Floats, prior_voxel: float, most_modes: int | None

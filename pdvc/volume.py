@@ -10,6 +10,8 @@ from scipy import ndimage
 
 Floats = NDArray[np.float64]
 
+_MARGIN_VOXEL = 3.0
+"""Voxels outside a hull that those inside are interpolated with, with room for how it was found."""
 DIRECTIONS = 16
 """Number of half-planes that bound each slab of a hull."""
 
@@ -44,6 +46,10 @@ class Hull:
             slab_mm=self.slab_mm,
             support_mm=windows.max(axis=-1) + margin_mm,
         )
+
+    def around_voxels(self, voxel_mm: float) -> Hull:
+        """Return the hull that encloses all voxels reconstructed within this one, and those they are mixed with."""
+        return self.grown(_MARGIN_VOXEL * voxel_mm)
 
     def box_mm(self) -> tuple[Floats, Floats]:
         """Return the lowest and highest corner (x, y, z) of the box around the hull, mm."""

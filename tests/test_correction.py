@@ -82,10 +82,12 @@ def test_an_image_that_did_not_move_is_the_same_to_the_last_bit():
 def test_modes_are_of_the_time_and_of_the_angle():
     series = experiment(views=30, steps=2).reference
     series = replace(series, time_s=np.zeros(30))
-    modes = modes_of(series)
+    modes = modes_of(series.angle_rad, series.time_s)
     assert modes["drift"][[0, -1]] == pytest.approx([-0.5, 0.5])
     assert modes["cos 2"] == pytest.approx(np.cos(2 * series.angle_rad))
-    assert view_motion({"turn sin 2": 2.0}, series)[:, DIRECTIONS.index("turn")] == pytest.approx(2 * modes["sin 2"])
+    assert view_motion({"turn sin 2": 2.0}, series.angle_rad, series.time_s)[
+        :, DIRECTIONS.index("turn")
+    ] == pytest.approx(2 * modes["sin 2"])
 
 
 def test_a_correction_is_kept_as_a_text():

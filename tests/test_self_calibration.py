@@ -86,14 +86,15 @@ def test_a_scanner_that_is_as_told_is_left_so():
 def test_a_sample_that_drifts_during_the_scan_is_followed(right, down, sign):
     """The sample is a rigid body that really moves; the correction only knows motion in the plane of the image."""
     series = prepared(3)[0]
-    t, wave = modes_of(series)["drift"], modes_of(series)["cos"]
+    modes = modes_of(series.angle_rad, series.time_s)
+    t, wave = modes["drift"], modes["cos"]
     way = np.stack([sign * right * t, down * wave, np.zeros(VIEWS)], axis=1)
     correction = found(3, sought="motion", shift_voxel=way)
     parameters = by_name(correction)
     assert parameters["right drift"].value_px == pytest.approx(sign * right, abs=EXACT_PX)
     assert parameters["down cos"].value_px == pytest.approx(down, abs=2 * EXACT_PX)
     # what is left of it, view by view, but for a sample that stands elsewhere
-    left = view_motion(correction.values_px, series)[:, 0] - way[:, 0]
+    left = view_motion(correction.values_px, series.angle_rad, series.time_s)[:, 0] - way[:, 0]
     waves = np.stack([np.ones(VIEWS), np.cos(series.angle_rad), np.sin(series.angle_rad)])
     left -= np.linalg.lstsq(waves.T, left, rcond=None)[0] @ waves
     assert np.sqrt(np.mean(left**2)) < EXACT_PX

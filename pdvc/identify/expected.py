@@ -20,12 +20,13 @@ from pdvc.geometry import nearest_angles
 from pdvc.identify.carried import Carrier
 from pdvc.identify.integrated import Radiographs, expected_covariance, radiographs_at
 from pdvc.identify.model import Model, neck_ramps
-from pdvc.identify.protocol import IdentifyOptions, problem_at, profile_from, spaces_of
+from pdvc.identify.protocol import IdentifyOptions, problem_at, profile_from
 from pdvc.onset import onset
 from pdvc.options import MeasureOptions
 from pdvc.preparation import prepare
 from pdvc.progress import Progress, silent
 from pdvc.setup import set_up
+from pdvc.smoother import Smoother
 from pdvc.state_space import Deviations, StateSpace
 
 Floats = NDArray[np.float64]
@@ -68,7 +69,7 @@ def expected_laws(
     basis, steps = setup.sections, len(views)
     still = np.zeros((steps, *basis.shape))
     problem = problem_at(setup, fine, basis, still, without_pattern=False, progress=progress)
-    spaces = spaces_of(problem)
+    spaces = Smoother().spaces(problem)
     radiographs = radiographs_at(problem, spaces, still.reshape(steps, -1))
     profile, share = profile_from(fine.images.volume, basis, options)
     voxel_mm = experiment.geometry.voxel_mm

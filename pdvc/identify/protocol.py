@@ -14,7 +14,6 @@ from pydantic import Field
 
 from pdvc.equations import Equations, linearise, residuals
 from pdvc.experiment import Experiment
-from pdvc.history import time_basis
 from pdvc.identify.beam import Profile, elongation_mm
 from pdvc.identify.carried import Carrier, shift_of
 from pdvc.identify.crosshead import from_crosshead
@@ -30,7 +29,6 @@ from pdvc.onset import force_noise, onset
 from pdvc.options import MeasureOptions
 from pdvc.pattern import fixed_pattern
 from pdvc.preparation import Prepared, noise_of, prepare
-from pdvc.process import FITTED_MODES
 from pdvc.progress import Progress, silent
 from pdvc.protocol import versions
 from pdvc.sections import TRANSLATION_Z, SectionBasis
@@ -38,7 +36,6 @@ from pdvc.settings import Settings
 from pdvc.setup import Setup, set_up
 from pdvc.smoother import Smoother
 from pdvc.solution import Problem
-from pdvc.state_space import StateSpace
 from pdvc.volume import Volume
 
 Floats = NDArray[np.float64]
@@ -113,17 +110,17 @@ class Ready:
         time_s = self.experiment.test.time_s
         return np.asarray(self.options.stroke_mm_per_s * np.maximum(time_s - time_s[self.loaded], 0.0))
 
-    @property
-    def largest_MPa(self) -> float:
-        """Return the largest stress of the test, that of the smallest section."""
-        return float(self.force_N.max() / self.model.profile.area_mm2.min())
-
     def two_steps(self, amplitude: Floats, covariance: Floats, start: Floats | None = None) -> dict[str, Estimate]:
         """Return what a measured motion (step, unknown) and its covariances (step, unknown, unknown) tell."""
         flat = zeroed(amplitude, self.loaded)
         plain = unweighted(self.model, flat, self.seen, self.force_N, self.sections, start)
         nearest = weighted(self.model, flat, covariance, self.seen, self.force_N, self.sections, plain.vector)
         return {UNWEIGHTED: plain, WEIGHTED: nearest}
+
+
+def largest_MPa(force_N: Floats, profile: Profile) -> float:
+    """Return the largest stress of a test, that of the smallest section."""
+    return float(force_N.max() / profile.area_mm2.min())
 
 
 def ready(
@@ -155,11 +152,10 @@ def ready(
         height_mm=profile.height_mm,
         shift_mm=shift_of(basis, amplitude.reshape(-1, *basis.shape), voxel_mm),
     )
-    largest_MPa = float(used.test.force_N.max() / profile.area_mm2.min())
     starts = options.law == law_named(str(options.law.kind))
     model = Model(
         # values that the user gave stay
-        law=options.law.started_for(largest_MPa) if starts else options.law,
+        law=options.law.started_for(largest_MPa(used.test.force_N, profile)) if starts else options.law,
         profile=profile,
         area_deviation=share,
         reference_N=float(np.mean(experiment.reference.force_N)),
@@ -374,7 +370,7 @@ def profile_from(volume: Volume, basis: SectionBasis, options: IdentifyOptions) 
 def _integrated(opened: Ready, start: Floats) -> tuple[Identified, Radiographs]:
     """Return what radiographs and force tell, walked again where the motion found is far from where they were."""
     problem, model, force_N = opened.problem, opened.model, opened.force_N
-    radiographs = radiographs_at(problem, spaces_of(problem), opened.amplitude)
+    radiographs = radiographs_at(problem, Smoother().spaces(problem), opened.amplitude)
     found = integrated(model, force_N, start, radiographs)
     for _ in range(1, MOST_PASSES):
         if np.sqrt(np.mean((found.amplitude - radiographs.amplitude) ** 2)) < MOVED_VOXEL:
@@ -384,14 +380,6 @@ def _integrated(opened: Ready, start: Floats) -> tuple[Identified, Radiographs]:
         model = carried_by(model, found.amplitude, problem.basis.shape)
         found = integrated(model, force_N, found.estimate.vector, radiographs, found.deviations)
     return found, radiographs
-
-
-def spaces_of(problem: Problem) -> tuple[StateSpace, StateSpace]:
-    """Return the states of whatever moves beside the law, in few modes and in all."""
-    solver, series = Smoother(), problem.series
-    trend, prior = time_basis(solver.trend, series), float(problem.prior.deviation_voxel.max())
-    few, every = (solver.space(problem.basis, series.time_s, trend, prior, modes) for modes in (FITTED_MODES, None))
-    return few, every
 
 
 def _compared(opened: Ready, found: Identified, radiographs: Radiographs) -> dict[str, float]:
@@ -404,7 +392,7 @@ def _compared(opened: Ready, found: Identified, radiographs: Radiographs) -> dic
     own = log_evidence(opened.model, opened.force_N, found.estimate.vector, radiographs, found.deviations)
     result = {kind: 0.0}
     for other in others:
-        law = law_named(other).started_for(opened.largest_MPa)
+        law = law_named(other).started_for(largest_MPa(opened.force_N, opened.model.profile))
         model = replace(opened.model, law=law)
         start = unweighted(model, flat, opened.seen, found.force_N, opened.sections).vector
         result[other] = log_evidence(model, opened.force_N, start, radiographs, found.deviations) - own

@@ -23,7 +23,7 @@ from pdvc.digest import digest, software
 from pdvc.experiment import Experiment
 from pdvc.identify.crosshead import from_crosshead
 from pdvc.identify.integrated import free_motion, integrated, radiographs_at
-from pdvc.identify.protocol import IdentifyOptions, Ready, ready, spaces_of
+from pdvc.identify.protocol import IdentifyOptions, Ready, ready
 from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, WEIGHTED
 from pdvc.identify.two_step import Estimate
 from pdvc.measurement import Measurement
@@ -31,6 +31,7 @@ from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.noise import Propagated
 from pdvc.options import DEFAULT
 from pdvc.protocol import measure
+from pdvc.smoother import Smoother
 from pdvc.state_space import Deviations
 from pdvc.store import read_arrays, write_arrays
 from simulator.scenario import Scenario
@@ -71,7 +72,7 @@ class First:
             measurement = measure(experiment, DEFAULT, work=folder)
             write_measurement(measurement, folder / "measurement.nc")
             opened = ready(experiment, measurement, self.options, work=folder)
-        radiographs = radiographs_at(opened.problem, spaces_of(opened.problem), opened.amplitude)
+        radiographs = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude)
         *_, free = free_motion(radiographs)
         start = opened.two_steps(opened.amplitude, _covariances(measurement, opened))[UNWEIGHTED].vector
         found = integrated(opened.model, opened.force_N, start, radiographs)
@@ -152,7 +153,7 @@ class Draw:
 
         opened = ready(experiment, measurement, self.options)
         noise = Propagated(parts=first["part"], own=first["own"], systematic=first["systematic"])
-        radiographs = radiographs_at(opened.problem, spaces_of(opened.problem), opened.amplitude, noise)
+        radiographs = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude, noise)
         note("ready")
         amplitude, covariance, _ = free_motion(radiographs, Deviations(**first["free"]))
         found: dict[str, Estimate] = opened.two_steps(amplitude, covariance, first["vector"])
