@@ -1,4 +1,4 @@
-"""Kernels whose arrays do not overlap, and are known not to.
+"""What kernels may take for granted: that their arrays do not overlap, and that no number is infinite.
 
 A loop that reads one array at places it works out itself, and writes to another, becomes vectors only if what it
 writes cannot be what it reads next. Numba does not say so of the arrays that a function is given, but can.
@@ -11,6 +11,13 @@ from typing import Any
 
 from numba import njit
 from numba.core.compiler import Compiler
+
+IN_ORDER = {"nnan", "ninf", "nsz"}
+"""The `fastmath` of kernels: numbers are finite, zeros have no sign, but nothing is reordered, fused or approximated.
+
+A function is compiled by itself and again within each kernel that calls it. The process that compiles runs the one
+copy, later ones, which load, the other: only if both work out every sum as it is written do they have the same bits.
+"""
 
 
 class _Apart(Compiler):

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from pdvc.alarms import Alarm, Watch
 from pdvc.compilation import compile_kernels
@@ -48,6 +47,7 @@ from pdvc.record import (
 from pdvc.resumable import measure_into
 from pdvc.setup import Setup, set_up
 from pdvc.store import Arrays, experiment_digest, read_arrays, write_arrays
+from pdvc.threads import one_thread
 from pdvc.tracker import Taken, Tracker
 from pdvc.verdict import listed
 
@@ -65,7 +65,7 @@ def make_ready(
     `experiment` as `read_experiment(folder, planned=True)` opens it. Interrupted, it goes on where it was. Raises
     ValueError where a test cannot be followed with these options.
     """
-    with held(work):
+    with held(work), one_thread():
         compile_kernels(progress=progress)
         Tracker(set_up(experiment, options, work=work, progress=progress), progress=progress)
 
@@ -91,19 +91,17 @@ def follow(
     record belongs to another one or is complete, InUseError where another process is at the same file.
     """
     folder, kept = work or file.with_name(file.name + ".work"), file.with_name(file.name + ".live")
-    with held(folder), held(kept), closing(Record(record_of(file))) as record:
+    with held(folder), held(kept), closing(Record(record_of(file))) as record, one_thread():
         _check_unfinished(record)
         compile_kernels(progress=progress)
         setup = set_up(experiment, options, work=folder, progress=progress)
-        # products of small matrices: two threads would wait for each other most of the time
-        with threadpool_limits(limits=1, user_api="blas"):
-            follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept, tell, see)
-            heard = time.monotonic() if follower.begun else float("inf")
-            while follower.waits and time.monotonic() < heard + idle_s:
-                if follower.look():
-                    heard = time.monotonic()
-                else:
-                    time.sleep(POLL_S)
+        follower = _Follower(setup, Tracker(setup, progress), radiographs, record, kept, tell, see)
+        heard = time.monotonic() if follower.begun else float("inf")
+        while follower.waits and time.monotonic() < heard + idle_s:
+            if follower.look():
+                heard = time.monotonic()
+            else:
+                time.sleep(POLL_S)
         recorded = follower.recorded()
         # volumes of all scales and e of all views are not needed any more
         del follower

@@ -37,6 +37,7 @@ from pdvc.result_checks import check_finite, doubts_of_result, doubts_of_spots
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, set_up
 from pdvc.solution import Known, Problem, Solution
+from pdvc.threads import one_thread
 from pdvc.uncertainty import posterior, stated
 from pdvc.verdict import Stop, Verdict, explained_by
 from pdvc.volume import Volume
@@ -62,7 +63,7 @@ def measure(
     time_parts = settled(options.time, experiment.test)
     doubts = (*doubts_of_data(examined, experiment), *doubts_of_time(time_parts, experiment.test))
     examining = time.perf_counter() - examining
-    with explained_by(doubts):
+    with one_thread(), explained_by(doubts):
         found, volume, spots = _measured(experiment, options, work, progress)
     geometry = experiment.geometry
     if found.correction is not None:

@@ -23,7 +23,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from pdvc.apart import apart
+from pdvc.apart import IN_ORDER, apart
 from pdvc.geometry import ConeBeam, gaps_rad
 from pdvc.progress import Progress, silent
 from pdvc.rays import directions
@@ -170,14 +170,14 @@ def _columns_inside(grid: Grid, hull: Hull) -> tuple[NDArray[np.bool_], NDArray[
     return inside, first
 
 
-@apart(fastmath=True, boundscheck=False)
+@apart(fastmath=IN_ORDER, boundscheck=False)
 def _blend(one, two, f, first, last, out):  # type: ignore[no-untyped-def]
     """Interpolate between two detector columns, over the rows first <= r < last."""
     for r in range(first, last):
         out[r] = one[r] + f * (two[r] - one[r])
 
 
-@apart(fastmath=True, boundscheck=False)
+@apart(fastmath=IN_ORDER, boundscheck=False)
 def _add_piece(out, line, first, last, place, step, weight):  # type: ignore[no-untyped-def]
     """Add what the voxels first <= k < last of a column see, all of it on the detector: `line` at place + k step.
 
@@ -205,7 +205,7 @@ def _add_piece(out, line, first, last, place, step, weight):  # type: ignore[no-
         k = end
 
 
-@apart(fastmath=True, boundscheck=False)
+@apart(fastmath=IN_ORDER, boundscheck=False)
 def _add_beside(out, line, first, last, place, step, weight):  # type: ignore[no-untyped-def]
     """The same where some of it is beside the detector, whose edge goes on there."""
     top = np.float32(len(line) - 2.001)

@@ -33,7 +33,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy import linalg
-from threadpoolctl import threadpool_limits
 
 from pdvc.coherent import by_block, excess
 from pdvc.equations import Equations, joined
@@ -44,6 +43,7 @@ from pdvc.projection import BlockVectors
 from pdvc.sections import SectionBasis
 from pdvc.solution import SHORTER, Known, Problem, Solution, Solver
 from pdvc.state_space import Deviations, StateSpace
+from pdvc.threads import one_thread
 from pdvc.verdict import Stop, listed
 
 Floats = NDArray[np.float64]
@@ -202,11 +202,6 @@ class Smoother(Solver):
 
 def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def one_thread() -> threadpool_limits:
-    """Keep products of small matrices to one thread: two would wait for each other most of the time."""
-    return threadpool_limits(limits=1, user_api="blas")
 
 
 def slow_functions(problem: Problem, degree: int = SLOW_DEGREE) -> Floats:

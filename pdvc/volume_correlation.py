@@ -50,6 +50,7 @@ from pdvc.result_checks import doubts_of_solution
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, outlined, set_up
 from pdvc.solution import Solution
+from pdvc.threads import one_thread
 from pdvc.uncertainty import UNSEEN, sandwich
 from pdvc.verdict import Stop, Verdict
 from pdvc.volume import Volume, halved, smoothed
@@ -90,22 +91,23 @@ def correlate(
     # volumes are filtered here, not the radiographs
     examined = usable(experiment, progress=progress)
     options = options.model_copy(update={"smooth_px": 0.0, "sharpen": False})
-    setup = set_up(experiment, options, work=work, progress=progress)
-    stages = _stages_of(setup)
+    with one_thread():
+        setup = set_up(experiment, options, work=work, progress=progress)
+        stages = _stages_of(setup)
 
-    def reference(scale: int) -> Volume:
-        return halved(smoothed(reference_volume(setup, scale, progress), SMOOTHING_VOXEL))
+        def reference(scale: int) -> Volume:
+            return halved(smoothed(reference_volume(setup, scale, progress), SMOOTHING_VOXEL))
 
-    references = {scale: reference(scale) for scale in dict.fromkeys(stage.scale for stage in stages)}
-    prepared = time.perf_counter()
-    found = {
-        scan.step: setup.store.arrays(
-            "correlation",
-            (scan.step, setup.options, setup.sections),
-            lambda scan=scan: _correlated(setup, references, scan, progress),  # type: ignore[misc]
-        )
-        for scan in experiment.interrupted
-    }
+        references = {scale: reference(scale) for scale in dict.fromkeys(stage.scale for stage in stages)}
+        prepared = time.perf_counter()
+        found = {
+            scan.step: setup.store.arrays(
+                "correlation",
+                (scan.step, setup.options, setup.sections),
+                lambda scan=scan: _correlated(setup, references, scan, progress),  # type: ignore[misc]
+            )
+            for scan in experiment.interrupted
+        }
     steps = list(found)
 
     observed = np.any([each["observed"] for each in found.values()], axis=0)

@@ -35,7 +35,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from pdvc.apart import apart
+from pdvc.apart import IN_ORDER, apart
 from pdvc.volume import Hull
 
 Floats = NDArray[np.float64]
@@ -355,7 +355,7 @@ def _limits(place, support, a, b, ends, limit):  # type: ignore[no-untyped-def]
     return True
 
 
-@apart(fastmath=True, boundscheck=False)
+@apart(fastmath=IN_ORDER, boundscheck=False)
 def _clip_hull(normals, limit, layers, ends, a, b, low, high, inner_a, inner_b):  # type: ignore[no-untyped-def]
     """Shrink [a, b] to where the moved rays, taken as straight between a and b, meet a hull; to nothing elsewhere.
 
@@ -385,7 +385,7 @@ def _clip_hull(normals, limit, layers, ends, a, b, low, high, inner_a, inner_b):
         inner_b[ray] = end if met else 0.0
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=IN_ORDER, inline="always")
 def _left_above(da, db):  # type: ignore[no-untyped-def]
     """Return the part of [0, 1] where what is da at 0 and db at 1 is positive; from 2 on if nowhere."""
     # crossed where the line between them is zero
@@ -433,14 +433,14 @@ def _range_of(planes):  # type: ignore[no-untyped-def]
     return (int(first), int(last)) if first < last else (0, 0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True, inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=IN_ORDER, inline="always")
 def _in_phase(f, phase):  # type: ignore[no-untyped-def]
     """Return the share of the next voxel at a place f in [0, 1] after one, and its derivative: `Volume.phase`."""
     away = f * (_f(1) - f)
     return f + phase * away * (_f(1) - _f(2) * f), _f(1) + phase * (_f(1) - _f(6) * away)
 
 
-@apart(fastmath=True, boundscheck=False)
+@apart(fastmath=IN_ORDER, boundscheck=False)
 def _sum_all(volume, strides, most, first, last, phase, path, planes, sums):  # type: ignore[no-untyped-def]
     """Sum F times 1, l, and d_o F times 1, l, l^2, over the planes that each ray crosses: (sum, ray).
 
@@ -493,7 +493,7 @@ def _sum_all(volume, strides, most, first, last, phase, path, planes, sums):  # 
             sums[7 * LANES + ray] += t * dz
 
 
-@apart(fastmath=True, boundscheck=False)
+@apart(fastmath=IN_ORDER, boundscheck=False)
 def _sum_values(volume, strides, most, first, last, phase, path, planes, sums):  # type: ignore[no-untyped-def]
     """Sum F alone over the planes that each ray crosses (ray,); arguments as of _sum_all.
 

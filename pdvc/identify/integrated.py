@@ -32,9 +32,10 @@ from pdvc.identify.model import Model
 from pdvc.identify.two_step import Estimate
 from pdvc.noise import Propagated
 from pdvc.process import ROUNDS, Process, Seen, Smoothed
-from pdvc.smoother import COHERENT_DEGREE, Fitted, known_of, of_image_model, one_thread, seen, slow_functions
+from pdvc.smoother import COHERENT_DEGREE, Fitted, known_of, of_image_model, seen, slow_functions
 from pdvc.solution import Problem
 from pdvc.state_space import Deviations, StateSpace
+from pdvc.threads import one_thread
 
 Floats = NDArray[np.float64]
 
