@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import rtk, stored
+from benchmarks import history, rtk, stored
 from benchmarks.case import Case, amplitude, case
 from benchmarks.timing import Seconds, in_turns, machine, once, with_threads
 from pdvc.experiment import read_experiment
@@ -46,6 +46,8 @@ class Rows:
         self._table = Table(
             "stage", "size", "threads", "time", "CPU", "compared with", "its time", "CPU", "ratio", "agreement"
         )
+        self._yardstick = history.yardstick()
+        self._entries: list[history.Entry] = []
 
     def add(
         self, stage: str, size: str, threads: int, taken: Seconds, other: str = "", its: Seconds = NONE, note: str = ""
@@ -55,10 +57,19 @@ class Rows:
         times = _time(taken.wall), _time(taken.cpu), other, _time(its.wall), _time(its.cpu)
         self._table.add_row(stage, size, str(threads), *times, ratio, note)
         self._console.print(f"  {stage}, {size}, {threads} thread(s): {' '.join(times)} {ratio} {note}", style="dim")
+        if other and not np.isnan(its.wall):
+            compared = other.partition(",")[0]
+        else:
+            compared, its = history.YARDSTICK, in_turns([self._yardstick], 3)[0]
+        self._entries.append(history.entry(stage, size, threads, taken.wall, compared, its.wall))
 
     def show(self) -> None:
-        """Print the table."""
+        """Print the table, and what became slower than it was; keep it."""
         self._console.print(self._table)
+        for line in history.losses(self._entries, history.read()):
+            self._console.print(line, style="bold", markup=False)
+        history.add(self._entries)
+        self._console.print(f"kept in {history.FILE}", markup=False)
 
 
 def _time(seconds: float) -> str:
