@@ -238,12 +238,18 @@ def test_a_mistake_is_answered_in_one_line_before_anything_is_done(tmp_path, tex
 
 def test_the_studies_of_the_documentation_are_valid(tmp_path):
     text = (Path(__file__).parent.parent / "docs" / "studies.md").read_text()
-    first, second = (block.partition("```")[0] for block in text.split("```toml")[1:])
+    first, second, third = (block.partition("```")[0] for block in text.split("```toml")[1:])
     found = trials(tmp_path, first)
     assert len(found) == 3 * 2 * 10
     assert found[-1].factors == {"photons_per_pixel": 8000.0, "nodules": "coarse"}
     assert found[-1].scenario.graphite.mean_diameter_mm == 0.4
     assert len(trials(tmp_path, 'name = "spread"\nrepetitions = 1\n' + second)) == 40
+    relative = trials(tmp_path, 'name = "drift"\nrepetitions = 1\ndesign = "morris"\nsamples = 2\n' + third)
+    usual = load_scenario("laboratory").scanner.open_beam
+    for trial in relative:
+        at = trial.scenario.scanner.open_beam
+        assert at.drift_per_hour == pytest.approx(trial.factors["beam_drift"] * usual.drift_per_hour)
+        assert at.tilt_per_hour == pytest.approx(trial.factors["beam_drift"] * usual.tilt_per_hour)
 
 
 def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
@@ -253,7 +259,7 @@ def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
 
 
 RUNS = {"noise": 80, "views-per-turn": 60, "sections": 60, "coverage": 60, "capture": 45, "resolution": 90}
-RUNS |= {"honest": 20, "which-error-matters": 64}
+RUNS |= {"honest": 20, "which-error-matters": 64, "which-error-matters-most": 48}
 
 
 @pytest.mark.parametrize(("name", "runs"), RUNS.items())

@@ -33,6 +33,7 @@ def influence_picture(study: Study, found: Sequence[Influence]) -> StudyPicture:
             if not any((each.part, each.quantity) == (part, quantity) for each in found):
                 ax.set_frame_on(False)
                 ax.set_xticks([])
+                ax.tick_params(axis="y", length=0)
                 continue
             some = {each.factor: each for each in found if (each.part, each.quantity) == (part, quantity)}
             draw_influences([some[name] for name in order], ax, scale=scale_of(study, part, quantity))
@@ -57,8 +58,9 @@ def draw_influences(found: Sequence[Influence], ax: Axes, *, scale: float = 1.0)
     ax.grid(axis="x", color="#e5e5e5", linewidth=0.8)
     ax.set_axisbelow(True)
     ax.spines[["top", "right", "left"]].set_visible(False)
-    ax.tick_params(axis="y", length=0)
+    ax.tick_params(axis="y", length=0, labelsize=8)
     ax.tick_params(axis="x", labelsize=8)
+    ax.locator_params(axis="x", nbins=5)
     return ax
 
 
