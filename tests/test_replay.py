@@ -277,6 +277,14 @@ class TestMovies:
         write_movie(tmp_path / "movie.mp4", steps, every=9)
         assert (tmp_path / "movie.mp4").read_bytes()[4:8] == b"ftyp"
 
+    @pytest.mark.skipif(not FFMpegWriter.isAvailable(), reason="no ffmpeg on PATH: no MP4 is written")
+    def test_an_ffmpeg_that_cannot_is_told_and_leaves_nothing(self, steps, tmp_path, monkeypatch):
+        writer = FFMpegWriter(codec="no-such-codec")
+        monkeypatch.setattr("validation.report.movie.movie_writer", lambda *_: writer)
+        with pytest.raises((ValueError, OSError)):
+            write_movie(tmp_path / "movie.mp4", steps, every=18)
+        assert list(tmp_path.iterdir()) == []
+
     def test_what_cannot_be_written_is_answered_in_one_line(self, folder, tmp_path, monkeypatch):
         monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
         for name, answer in {

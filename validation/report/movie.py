@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +39,10 @@ def movie_writer(path: Path, steps_per_s: float) -> AbstractMovieWriter:
 def write_movie(
     path: Path, steps: Steps, *, every: int = 1, steps_per_s: float = 10.0, progress: Progress = silent
 ) -> None:
-    """Write every so-manieth step as a frame; what is at the path is replaced once all are written."""
+    """Write one of `every` steps as a frame; what is at the path is replaced once all are written.
+
+    Raises ValueError where ffmpeg cannot write what is asked of it.
+    """
     writer = movie_writer(path, steps_per_s)
     chosen = range(0, steps.measurement.recording.steps, every)
     frame = Frame.of(steps)
@@ -51,6 +55,10 @@ def write_movie(
                 writer.grab_frame()
                 progress("frames", done, len(chosen))
         partial.replace(path)
+    except subprocess.CalledProcessError as error:
+        raise ValueError(
+            f"{path}: expected ffmpeg to write H.264, it ended with code {error.returncode}: ask for a .gif"
+        ) from None
     finally:
         partial.unlink(missing_ok=True)
 
