@@ -114,6 +114,7 @@ def test_a_laboratory_needs_no_extra_to_measure(tmp_path):
         (("plan", "quick"), SIMULATING, "simulate"),
         (("study", "noise", "-o", "out"), MANY, "many"),
         (("compare", "quick", "-o", "out"), MANY, "many"),
+        (("study", "which-error-matters", "-o", "out"), {"SALib"}, "sensitivity"),
         (("page", "motion.nc"), LIVE, "live"),
         (("export", "motion.nc", "--parquet", "out"), {"pyarrow"}, "parquet"),
     ],

@@ -195,7 +195,7 @@ MISTAKES = {
     BASE + FACTOR.replace("scenario.", "") + "values = [1]": "unknown key; did you mean 'scenario.detector.frames'?",
     BASE + FACTOR.replace("detector.frames", "repetition") + "values = [1]": "scenario.repetition is what",
     BASE + FACTOR: "factor.0: expected either values, or low and high",
-    BASE + FACTOR + "low = 1\nhigh = 5": "values of factor frames, as only a Latin hypercube takes low and high",
+    BASE + FACTOR + "low = 1\nhigh = 5": "values of factor frames, as a grid takes no low and high",
     BASE + FACTOR + "values = [1]\n" + FACTOR + "values = [2]": "expected another name for factor frames",
     BASE + FACTOR + 'values = [1]\nname = "strain_rms"': "expected another name for factor strain_rms",
     'draw = ["strech_share"]\n' + BASE: "among the scores, got 'strech_share'; did you mean 'stretch_share'?",
@@ -208,7 +208,14 @@ MISTAKES = {
     BASE + '[[factor]]\nkey = "options.discard_rows"\nvalues = [30]': "options.discard_rows = 30: options:",
     'design = "list"\n' + BASE + FACTORS.replace("[3, 5]", "[3]"): "as many values of each factor in a list",
     'design = "latin-hypercube"\n' + BASE + FACTORS: "expected samples for design = 'latin-hypercube'",
-    'design = "random"\n' + BASE: "design: expected 'grid', 'list' or 'latin-hypercube', given 'random'",
+    'design = "random"\n' + BASE: "'latin-hypercube', 'morris' or 'sobol', given 'random'",
+    'design = "sobol"\nsamples = 6\n' + BASE + FACTORS: "samples a power of two for design = 'sobol', got 6",
+    'design = "morris"\nsamples = 6\n' + BASE: "at least one [[factor]] for design = 'morris'",
+    BASE + FACTOR + 'relative = true\nvalues = ["twice"]': "numbers, as the factor is relative, got ('twice',)",
+    BASE + FACTOR.replace("detector.frames", "scanner.scatter.ratio") + "relative = true\nvalues = [2]": (
+        "scatter.ratio': expected a number other than 0 in the base, as the factor is relative, found 0.0"
+    ),
+    BASE + FACTOR.replace("detector.frames", "specimen.thinned") + "relative = true\nvalues = [2]": "found 'both'",
     BASE.replace("[change.options]", "[change.option]"): "change.option: unknown key; did you mean 'options'?",
     BASE + '[change.scenario.detector]\nframe = 3': "change.scenario.detector.frame: unknown key; did you mean",
     BASE + '[change.scenario.detector]\nframes = 3.5': "scenario: detector.frames: expected a valid integer",
@@ -231,12 +238,18 @@ def test_a_mistake_is_answered_in_one_line_before_anything_is_done(tmp_path, tex
 
 def test_the_studies_of_the_documentation_are_valid(tmp_path):
     text = (Path(__file__).parent.parent / "docs" / "studies.md").read_text()
-    first, second = (block.partition("```")[0] for block in text.split("```toml")[1:])
+    first, second, third = (block.partition("```")[0] for block in text.split("```toml")[1:])
     found = trials(tmp_path, first)
     assert len(found) == 3 * 2 * 10
     assert found[-1].factors == {"photons_per_pixel": 8000.0, "nodules": "coarse"}
     assert found[-1].scenario.graphite.mean_diameter_mm == 0.4
     assert len(trials(tmp_path, 'name = "spread"\nrepetitions = 1\n' + second)) == 40
+    relative = trials(tmp_path, 'name = "drift"\nrepetitions = 1\ndesign = "morris"\nsamples = 2\n' + third)
+    usual = load_scenario("laboratory").scanner.open_beam
+    for trial in relative:
+        at = trial.scenario.scanner.open_beam
+        assert at.drift_per_hour == pytest.approx(trial.factors["beam_drift"] * usual.drift_per_hour)
+        assert at.tilt_per_hour == pytest.approx(trial.factors["beam_drift"] * usual.tilt_per_hour)
 
 
 def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
@@ -246,6 +259,7 @@ def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
 
 
 RUNS = {"noise": 80, "views-per-turn": 60, "sections": 60, "coverage": 60, "capture": 45, "resolution": 90}
+RUNS |= {"honest": 20, "which-error-matters": 64, "which-error-matters-most": 48}
 
 
 @pytest.mark.parametrize(("name", "runs"), RUNS.items())
@@ -324,6 +338,32 @@ class TestAWholeStudy:
         assert result.exit_code == 0, result.stderr
         assert {path: path.stat().st_mtime_ns for path in (folder / "out" / "runs").iterdir()} == before
         assert (folder / "out" / "study.html").exists()
+
+    def test_effects_are_those_of_the_runs_that_the_command_line_made(self, address, tmp_path, monkeypatch):
+        monkeypatch.setattr("validation.study.page.study_pictures", lambda *_: [])
+        base = BASE.replace("repetitions = 2", 'repetitions = 1\ndesign = "morris"\nsamples = 2\n')
+        base += "[change.scenario]\nscanner.scatter.ratio = 0.05\nscanner.lag.share = 0.05\n"
+        for key in ("scatter.ratio", "lag.share"):
+            base += f'[[factor]]\nkey = "scenario.scanner.{key}"\nrelative = true\nlow = 0.0\nhigh = 2.0\n'
+        out = tmp_path / "out"
+        result = pdvc_bench("study", written(tmp_path, base), "-o", out, "--scheduler", address)
+        assert result.exit_code == 0, result.stderr
+        found = pd.read_csv(out / "sensitivity.csv").set_index(["factor", "part", "quantity"])
+        table = pd.read_parquet(out / "table.parquet")
+        steps = table[["ratio", "share", "bias_voxel_vertical"]].diff().drop(index=[0, 3])
+        for name in ("ratio", "share"):
+            moved = steps[steps[name] != 0]
+            assert len(moved) == 2
+            # changes are over the whole range, 0 to 2
+            change = 2 * moved["bias_voxel_vertical"] / moved[name]
+            told = found.loc[(name, "bias", "voxel_vertical")]
+            assert told["mu_star"] == pytest.approx(change.abs().mean())
+            assert told["mu"] == pytest.approx(change.mean())
+            assert told["sigma"] == pytest.approx(change.std())
+        assert "bias: mean change over its range, mu*" in result.stdout
+        assert (out / "figures" / "sensitivity.png").exists()
+        page = (out / "study.html").read_text()
+        assert page.count("<tr>", page.index('id="sensitivity"'), page.index("<h2>Errors")) == 4
 
     def test_a_run_that_fails_is_a_row_and_the_rest_goes_on(self, address, tmp_path, monkeypatch):
         monkeypatch.setattr("validation.study.page.study_pictures", lambda *_: [])

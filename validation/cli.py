@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from validation.commands import doors, identifying, live, many, one, watching
+from validation.commands import doors, identifying, live, many, one, replaying, watching
 from validation.commands.parts import Debugging
 
 app = typer.Typer(
@@ -38,6 +38,7 @@ def _common(
 
 for _command in (
     *(one.scenarios, one.options, one.simulate, one.inspect, one.measure, one.score, one.report, one.run),
+    *(replaying.replay, replaying.movie),
     *(many.compare, many.studies, many.study, many.plan),
     *(identifying.identify, identifying.identify_draws),
     *(live.prepare, live.live, live.play),

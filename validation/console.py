@@ -274,14 +274,26 @@ def resolved_table(study: Study, found: Sequence[Resolution]) -> Table:
     return table
 
 
+def influence_tables(study: Study, heads: Sequence[tuple[str, str]], rows: Sequence[Sequence[str]]) -> Iterator[Table]:
+    """Return a table for each part of the error: what each factor does to it, the one that matters most first."""
+    what = "mean change over its range, mu*" if study.design == "morris" else "share of the variance, total index"
+    for part in dict.fromkeys(part for part, _ in heads):
+        table = Table(title=f"{study.name}: {part}: {what}", title_justify="left", box=None, pad_edge=False)
+        chosen = [n for n, (each, _) in enumerate(heads) if each == part]
+        for name in ("factor", *(heads[n][1] for n in chosen)):
+            table.add_column(name, justify="left" if name == "factor" else "right")
+        for label, *cells in rows:
+            table.add_row(label, *(cells[n] for n in chosen))
+        yield table
+
+
 def study_table(studies: Iterable[Study]) -> Table:
     """Return the studies as a table, one line each."""
     table = Table(box=None, pad_edge=False)
     for name in ("name", "runs", "scenario", "what it asks"):
         table.add_column(name, justify="right" if name == "runs" else "left")
     for each in studies:
-        counts = [len(factor.values) for factor in each.factor]
-        table.add_row(each.name, str(each.repetitions * math.prod(counts)), each.scenario, each.title)
+        table.add_row(each.name, str(each.repetitions * each.combinations), each.scenario, each.title)
     return table
 
 

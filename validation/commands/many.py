@@ -126,13 +126,20 @@ def study(
             )
     from rich.console import Console
 
-    from validation.console import honesty_table, resolved_table, study_summary
+    from validation.console import honesty_table, influence_tables, resolved_table, study_summary
     from validation.study.coverage import honesty
+    from validation.study.page import influence_heads, influence_rows
     from validation.study.resolution import resolutions
+    from validation.study.sensitivity import influences
+    from validation.study.summary import mean_scores
 
     resolved = resolutions(chosen, table, out)
+    mattering = influences(chosen, summary, mean_scores(chosen, table))
     if resolved:
         Console().print(resolved_table(chosen, resolved))
+    elif mattering:
+        for each in influence_tables(chosen, influence_heads(chosen, mattering), influence_rows(chosen, mattering)):
+            Console().print(each)
     elif chosen.pooled:
         for found in honesty(chosen, table):
             Console().print(honesty_table(chosen, found))

@@ -7,7 +7,11 @@ design says how the values of several factors are combined:
 - ``grid``: every value of each with every value of the others;
 - ``list``: the first values of all, then the second ones, and so on;
 - ``latin-hypercube``: `samples` combinations, such that the range of each factor, cut into as many parts of equal
-  probability, is met once in each part.
+  probability, is met once in each part;
+- ``morris``, ``sobol``: what an analysis of sensitivity asks for, of `samples` trajectories or pairs of points
+  (`validation.study.points`).
+
+A factor may also multiply what the base has (``relative``), so that 1 stands for a usual size.
 
 Each combination is carried out `repetitions` times, with other noise of the same sample and detector. Repetition 3 of
 one combination has the same random streams as repetition 3 of another, so that differences between combinations
@@ -19,6 +23,7 @@ from __future__ import annotations
 import copy
 import difflib
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -34,6 +39,7 @@ from pdvc.settings import Settings, SettingsError
 from simulator.scenario import Scenario, load_scenario
 from validation.batch.engine import Scalar
 from validation.batch.trial import BOUND_COLUMNS, RECOVERY_COLUMNS, Trial, score_columns
+from validation.study.points import SAMPLED, block_length, unit_points
 
 _TAKEN = ("seed", "repetition", "status", "reason", "seconds", "version", "key", "runs", "failed")
 
@@ -46,9 +52,11 @@ class Factor(Settings):
     values: tuple[Any, ...] = ()
     """values to take; with several keys, a list of values for each; a table changes the keys that it names"""
     low: float | None = None
-    """for a Latin hypercube, instead of values: lower end of the range"""
+    """for a design of samples, instead of values: lower end of the range"""
     high: float | None = None
     """upper end of the range"""
+    relative: bool = False
+    """whether values are multiples of what the base has, a number or a list of them; the same for all keys"""
     log: bool = False
     """whether the range is even in the logarithm, and whether figures have a logarithmic axis"""
     name: str | None = None
@@ -70,11 +78,13 @@ class Factor(Settings):
                 raise ValueError(f"low below high, got {self.low} and {self.high}")
             if self.log and self.low <= 0:
                 raise ValueError(f"low above 0, as the range is even in the logarithm, got {self.low}")
-            if not isinstance(self.key, str):
+            if not isinstance(self.key, str) and not self.relative:
                 raise ValueError("values, as several keys change together")
         if self.names and len(self.names) != len(self.values):
             raise ValueError(f"as many names as values, {len(self.values)}, got {len(self.names)}")
-        if not isinstance(self.key, str):
+        if self.relative and not all(type(value) in (int, float) for value in self.values):
+            raise ValueError(f"numbers, as the factor is relative, got {self.values}")
+        if not isinstance(self.key, str) and not self.relative:
             for row in self.values:
                 if not isinstance(row, (list, tuple)) or len(row) != len(self.key):
                     raise ValueError(f"for each value a list of {len(self.key)}, one for each key, got {row!r}")
@@ -96,7 +106,9 @@ class Factor(Settings):
         return self.label or self.column.replace("_", " ")
 
     def rows(self) -> list[tuple[Any, ...]]:
-        """Return for each value what each key becomes."""
+        """Return for each value what each key becomes, or is multiplied by."""
+        if self.relative:
+            return [(value,) * len(self.keys) for value in self.values]
         return [(value,) if isinstance(self.key, str) else tuple(value) for value in self.values]
 
 
@@ -116,11 +128,11 @@ class Study(Settings):
     repetitions: Annotated[int, Field(ge=1, le=100_000)] = 10
     """noise draws of each combination"""
     seed: Annotated[int, Field(ge=0)] = 0
-    """of the sample, the detector, all noise and the Latin hypercube"""
-    design: Literal["grid", "list", "latin-hypercube"] = "grid"
+    """of the sample, the detector, all noise and the design"""
+    design: Literal["grid", "list", "latin-hypercube", "morris", "sobol"] = "grid"
     """how the values of several factors are combined"""
     samples: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    """combinations of a Latin hypercube"""
+    """combinations of a Latin hypercube, trajectories of Morris, or pairs of points of Sobol, a power of two"""
     pooled: bool = False
     """whether coverage is asked of all combinations together, each one draw of what may happen"""
     draw: tuple[str, ...] = ()
@@ -130,13 +142,16 @@ class Study(Settings):
 
     @model_validator(mode="after")
     def _design_fits_factors(self) -> Self:
-        if (self.samples is not None) != (self.design == "latin-hypercube"):
-            raise ValueError("samples for design = 'latin-hypercube', and for no other")
-        if self.design == "latin-hypercube" and not self.factor:
-            raise ValueError("at least one [[factor]] for a Latin hypercube")
+        sampled = self.design in SAMPLED
+        if (self.samples is not None) != sampled:
+            raise ValueError("samples for design = 'latin-hypercube', 'morris' or 'sobol', and for no other")
+        if sampled and not self.factor:
+            raise ValueError(f"at least one [[factor]] for design = {self.design!r}")
+        if self.samples is not None and self.design == "sobol" and self.samples & (self.samples - 1):
+            raise ValueError(f"samples a power of two for design = 'sobol', got {self.samples}")
         for factor in self.factor:
-            if not factor.values and self.design != "latin-hypercube":
-                raise ValueError(f"values of factor {factor.column}, as only a Latin hypercube takes low and high")
+            if not factor.values and not sampled:
+                raise ValueError(f"values of factor {factor.column}, as a {self.design} takes no low and high")
         lengths = {len(factor.values) for factor in self.factor}
         if self.design == "list" and len(lengths) > 1:
             raise ValueError(f"as many values of each factor in a list, got {sorted(lengths)}")
@@ -149,6 +164,14 @@ class Study(Settings):
             if score_columns().get(name) not in (int, float):
                 raise ValueError(f"draw of numbers among the scores, got {name!r}{_hint(name, list(score_columns()))}")
         return self
+
+    @property
+    def combinations(self) -> int:
+        """Return how many combinations of the factors' values there are."""
+        if self.samples is not None:
+            return self.samples * block_length(self.design, len(self.factor))
+        counts = [len(factor.values) for factor in self.factor]
+        return math.prod(counts) if self.design == "grid" else min(counts, default=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,19 +222,33 @@ def trials_of(study: Study, path: Path) -> list[Trial]:
 
 def combinations(study: Study, base: dict[str, Any]) -> list[Combination]:
     """Return the combinations of a study's factors; `base` tells which keys hold whole numbers."""
-    if study.design == "latin-hypercube":
-        return list(_hypercube(study, base))
-    choices = [_choices(factor) for factor in study.factor]
+    if study.design in SAMPLED:
+        return list(_sampled(study, base))
+    choices = [_choices(factor, base) for factor in study.factor]
     together = zip(*choices, strict=True) if study.design == "list" and choices else product(*choices)
     return [_combined(chosen) for chosen in together]
 
 
-def _choices(factor: Factor) -> list[Combination]:
+def _choices(factor: Factor, base: dict[str, Any]) -> list[Combination]:
     shown = factor.names or [row[0] for row in factor.rows()]
     return [
-        Combination(changes=tuple(zip(factor.keys, row, strict=True)), factors={factor.column: said})
+        Combination(changes=_changes(factor, row, base), factors={factor.column: said})
         for row, said in zip(factor.rows(), shown, strict=True)
     ]
+
+
+def _changes(factor: Factor, row: Sequence[Any], base: dict[str, Any]) -> tuple[tuple[str, Any], ...]:
+    """Return what each key of a factor becomes."""
+    if not factor.relative:
+        return tuple(zip(factor.keys, row, strict=True))
+    return tuple((key, _times(row[0], _look_up(base, key.split(".")))) for key in factor.keys)
+
+
+def _times(share: float, usual: Any) -> Any:
+    """Return a multiple of a number, whole if that is, or of each of a list."""
+    if isinstance(usual, (list, tuple)):
+        return [_times(share, each) for each in usual]
+    return round(share * usual) if type(usual) is int else float(share * usual)
 
 
 def _combined(chosen: Sequence[Combination]) -> Combination:
@@ -219,22 +256,23 @@ def _combined(chosen: Sequence[Combination]) -> Combination:
     return Combination(changes=tuple(change for each in chosen for change in each.changes), factors=factors)
 
 
-def _hypercube(study: Study, base: dict[str, Any]) -> Iterator[Combination]:
-    from scipy.stats.qmc import LatinHypercube
-
-    sampler = LatinHypercube(len(study.factor), rng=np.random.default_rng(study.seed))
-    for point in sampler.random(study.samples):
+def _sampled(study: Study, base: dict[str, Any]) -> Iterator[Combination]:
+    assert study.samples is not None
+    for point in unit_points(study.design, len(study.factor), study.samples, study.seed):  # type: ignore[arg-type]
         yield _combined([_at(factor, float(share), base) for factor, share in zip(study.factor, point, strict=True)])
 
 
 def _at(factor: Factor, share: float, base: dict[str, Any]) -> Combination:
     """Return a factor's value at a share, 0 to 1, of its range."""
     if factor.low is None or factor.high is None:
-        return _choices(factor)[int(share * len(factor.values))]
+        # a share of 1, where trajectories go, is the last value
+        return _choices(factor, base)[min(int(share * len(factor.values)), len(factor.values) - 1)]
     if factor.log:
         value = float(np.exp(np.log(factor.low) + share * np.log(factor.high / factor.low)))
     else:
         value = factor.low + share * (factor.high - factor.low)
+    if factor.relative:
+        return Combination(changes=_changes(factor, (value,), base), factors={factor.column: value})
     usual = _look_up(base, factor.keys[0].split("."))
     # a number that is left open may be a whole one: the limits tell
     whole = type(usual) is int or (usual is None and factor.low == int(factor.low) and factor.high == int(factor.high))
@@ -257,6 +295,8 @@ def _changed_base(study: Study, path: Path) -> dict[str, Any]:
     for factor in study.factor:
         for key in factor.keys:
             _check_path(base, key, path)
+            if factor.relative:
+                _check_multiplied(_look_up(base, key.split(".")), key, path)
     return base
 
 
@@ -280,6 +320,16 @@ def _check_path(base: dict[str, Any], key: str, path: Path) -> None:
             hint = _hint(key, near) or _hint(key, list(_paths(base)))
             raise SettingsError(f"{path}: factor.key: {key!r}: unknown key{hint}")
         part = part[name]
+
+
+def _check_multiplied(usual: Any, key: str, path: Path) -> None:
+    """Raise SettingsError unless a multiple of what the base has is another number."""
+    parts = usual if isinstance(usual, (list, tuple)) else [usual]
+    if not (parts and all(type(part) in (int, float) for part in parts) and any(parts)):
+        raise SettingsError(
+            f"{path}: factor.key: {key!r}: expected a number other than 0 in the base, as the factor is relative, "
+            f"found {usual!r}"
+        )
 
 
 def _hint(given: str, known: list[str]) -> str:

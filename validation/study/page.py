@@ -19,6 +19,8 @@ from validation.study.figures import study_pictures
 from validation.study.resolution import Resolution, resolution_table, resolutions
 from validation.study.resolution_figures import resolution_picture
 from validation.study.score_figures import score_pictures
+from validation.study.sensitivity import Influence, influence_table, influences, ranked
+from validation.study.sensitivity_figures import PART_NAMES, TITLES, influence_picture, scale_of, unit_of
 from validation.study.summary import PARTS, QUANTITIES, mean_scores, summarise
 
 HEADINGS = {
@@ -40,22 +42,27 @@ def write_study_report(
     scores = mean_scores(study, table)
     shown = honesty(study, table)
     resolved = resolutions(study, table, folder)
+    mattering = influences(study, summary, scores)
     frames = {"summary": summary, "scores": scores, "coverage": coverage_table(shown)}
     if resolved:
         frames["resolution"] = resolution_table(resolved)
+    if mattering:
+        frames["sensitivity"] = influence_table(study, mattering)
     for name, frame in frames.items():
         partial = folder / f"{name}.csv.partial"
         frame.to_csv(partial, index=False)
         partial.replace(folder / f"{name}.csv")
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     pictures = []
-    drawn = [*([resolution_picture(resolved)] if resolved else []), *score_pictures(study, scores)]
-    for picture in (*drawn, *study_pictures(study, summary)):
+    drawn = [resolution_picture(resolved)] if resolved else []
+    drawn += [influence_picture(study, mattering)] if mattering else []
+    for picture in (*drawn, *score_pictures(study, scores), *study_pictures(study, summary)):
         data = save(picture.figure, folder / "figures" / f"{picture.name}.png", dpi=120)
         pictures.append({"name": picture.name, "caption": picture.caption, "data": data})
     page = folder / "study.html"
     partial = page.with_name("study.html.partial")
-    partial.write_text(_page(study, text, table, summary, scores, shown, resolved, pictures, where), encoding="utf-8")
+    content = _page(study, text, table, summary, scores, shown, resolved, mattering, pictures, where)
+    partial.write_text(content, encoding="utf-8")
     partial.replace(page)
     return page, summary
 
@@ -68,6 +75,7 @@ def _page(
     scores: pd.DataFrame,
     shown: list[Honesty],
     resolved: list[Resolution],
+    mattering: list[Influence],
     pictures: list[dict[str, str]],
     where: str,
 ) -> str:
@@ -100,6 +108,8 @@ def _page(
         wavelengths=[f"{length:g}" for length in resolved[0].wavelength_mm] if resolved else [],
         resolved=[_resolved(each) for each in resolved],
         resolved_by=[name.replace("_", " ") for name in resolved[0].combination] if resolved else [],
+        influenced=influence_heads(study, mattering),
+        influence_rows=influence_rows(study, mattering),
         scores_columns=list(scores.columns),
         scores=[[_cell(value) for value in row] for row in scores.itertuples(index=False)],
         pictures=pictures,
@@ -134,6 +144,34 @@ def _resolved(found: Resolution) -> list[str]:
         _cell(found.indicator_um),
         _cell(found.strain_indicator_um_mm),
     ]
+
+
+def influence_heads(study: Study, found: list[Influence]) -> list[tuple[str, str]]:
+    """Return part and quantity, with the unit in which they are shown, of each column of `influence_rows`."""
+    return [
+        (PART_NAMES[part], f"{TITLES[quantity]}{unit_of(study, part, quantity)}")
+        for part, quantity in _asked_of(found)
+    ]
+
+
+def influence_rows(study: Study, found: list[Influence]) -> list[list[str]]:
+    """Return a line for each factor, the one that matters most first: its influences as they are shown."""
+    labels = {factor.column: factor.axis_label for factor in study.factor}
+    told = {(each.factor, each.part, each.quantity): each for each in found}
+    return [
+        [labels[name], *(_influence(study, told[name, part, quantity]) for part, quantity in _asked_of(found))]
+        for name in (ranked(found) if found else [])
+    ]
+
+
+def _asked_of(found: list[Influence]) -> list[tuple[str, str]]:
+    return list(dict.fromkeys((each.part, each.quantity) for each in found))
+
+
+def _influence(study: Study, found: Influence) -> str:
+    scale = scale_of(study, found.part, found.quantity)
+    half = f" ± {_cell(scale * found.whole.half_width)}" if np.isfinite(found.whole.low) else ""
+    return f"{_cell(scale * found.whole.value)}{half}"
 
 
 def _interval(estimate: Estimate) -> str:
