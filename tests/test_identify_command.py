@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pdvc.experiment import read_experiment
-from pdvc.identify.protocol import IdentifyOptions, identify
+from pdvc.identify.options import IdentifyOptions
+from pdvc.identify.protocol import identify
 from pdvc.identify.result import IdentificationError, read_identification
 from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.protocol import measure

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pdvc.identify.protocol import IdentifyOptions
+from pdvc.identify.options import IdentifyOptions
 from simulator.scenario import load_scenario
 from validation.identify.draws import METHODS, draws
 from validation.identify.recovery import recovery

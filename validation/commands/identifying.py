@@ -21,7 +21,7 @@ from validation.commands.parts import (
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from pdvc.identify.protocol import IdentifyOptions
+    from pdvc.identify.options import IdentifyOptions
     from simulator.scenario import Scenario
 
 Laws = Annotated[
@@ -81,7 +81,7 @@ def identify(
     """
     with answering() as progress:
         from pdvc.experiment import read_experiment
-        from pdvc.identify.protocol import IdentifyOptions
+        from pdvc.identify.options import IdentifyOptions
         from pdvc.identify.protocol import identify as find
         from pdvc.identify.result import write_identification
         from pdvc.measurement_file import read_measurement
@@ -129,7 +129,7 @@ def identify_draws(
     Example:  `pdvc-bench identify-draws quick --draws 50 -o out/draws`
     """
     with answering(resume="give the same command again to go on from here") as progress:
-        from pdvc.identify.protocol import IdentifyOptions
+        from pdvc.identify.options import IdentifyOptions
         from pdvc.lock import held
         from simulator.scenario import load_scenario
         from validation.batch.engine import run_trials
@@ -160,7 +160,7 @@ def tell_planned_law(scenario: str, law: str, options: str, out: Path | None, th
         from pdvc.experiment import DESCRIPTION, read_experiment
         from pdvc.identify.expected import expected_laws
         from pdvc.identify.laws import law_named
-        from pdvc.identify.protocol import IdentifyOptions
+        from pdvc.identify.options import IdentifyOptions
         from validation.job import write_text
 
         asked, read, folder = IdentifyOptions(law=law_named(law)), read_options(options), Path(scenario)

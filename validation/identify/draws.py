@@ -23,7 +23,8 @@ from pdvc.digest import digest, software
 from pdvc.experiment import Experiment
 from pdvc.identify.crosshead import from_crosshead
 from pdvc.identify.integrated import free_motion, integrated, radiographs_at
-from pdvc.identify.protocol import IdentifyOptions, Ready, ready
+from pdvc.identify.opening import Ready, ready
+from pdvc.identify.options import IdentifyOptions
 from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, WEIGHTED
 from pdvc.identify.two_step import Estimate
 from pdvc.measurement import Measurement
