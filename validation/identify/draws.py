@@ -1,17 +1,23 @@
-"""One draw of an identification study: other noise of all images and forces, the same sample, motion and law.
+"""One draw of an identification study: other noise of all images and forces, and every few draws another texture.
 
-The first draw is measured in full (`First`, a part that all draws share), and tells the deviations of the processes
-and the noise of all images. Each draw is then made ready by itself, counts, volume, areas, pattern and pass, at the
-motion that the first one found: the true motion is the same, and what draws differ by is far within what is linear.
-Its own motion, for the two-step methods, is one step of the smoother from there; the integrated identification seeks
-its process's deviations once more, from those of the first.
+What intervals hold beside noise, as what re-projection leaves of the texture, does not differ from one draw of noise
+to the next: a coverage of these alone would be that of one texture's luck. So several textures (`Texture`) have some
+draws of noise each, with the same sample, motion and law.
+
+The first texture is measured in full (`First`, a part that all draws share), and tells the deviations of the processes
+to start from. A texture has its own covariance of noise and beam-hardening polynomial, found once. Each draw is then
+made ready by itself, counts, volume, areas, pattern and pass, at the motion that the first one found: the true motion
+is the same, and what draws differ by is far within what is linear. Its own motion, for the two-step methods, is one
+step of the smoother from there; the integrated identification seeks its process's deviations once more, from those of
+the first.
 """
 
 from __future__ import annotations
 
 import time
+import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,8 +36,9 @@ from pdvc.identify.two_step import Estimate
 from pdvc.measurement import Measurement
 from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.noise import Propagated
-from pdvc.options import DEFAULT
+from pdvc.options import DEFAULT, MeasureOptions
 from pdvc.protocol import measure
+from pdvc.setup import set_up
 from pdvc.smoother import Smoother
 from pdvc.state_space import Deviations
 from pdvc.store import read_arrays, write_arrays
@@ -77,29 +84,56 @@ class First:
         *_, free = free_motion(radiographs)
         start = opened.two_steps(opened.amplitude, _covariances(measurement, opened))[UNWEIGHTED].vector
         found = integrated(opened.model, opened.force_N, start, radiographs)
-        arrays: dict[str, NDArray[Any]] = {"vector": found.estimate.vector, "systematic": radiographs.noise.systematic}
-        for group, values in (
-            ("free", vars(free)),
-            ("law", vars(found.deviations)),
-            ("own", radiographs.noise.own),
-            ("part", radiographs.noise.parts),
-        ):
+        arrays: dict[str, NDArray[Any]] = {"vector": found.estimate.vector}
+        for group, values in (("free", vars(free)), ("law", vars(found.deviations))):
             arrays |= {f"{group}:{name}": value for name, value in values.items()}
         write_arrays(folder / "known.kept", arrays)
 
     def read(self, shared: Path) -> tuple[Measurement, dict[str, Any]]:
         """Return its measurement, and what else was found, by groups."""
         self.make(shared)
-        kept = read_arrays(shared / self.name / "known.kept")
-        assert kept is not None, "it was made"
-        groups: dict[str, Any] = {"free": {}, "law": {}, "own": {}, "part": {}}
-        for name, value in kept.items():
-            group, _, rest = name.partition(":")
-            if rest:
-                groups[group][rest] = value
-            else:
-                groups[name] = value
+        groups = _grouped(shared / self.name / "known.kept")
         return read_measurement(shared / self.name / "measurement.nc"), groups
+
+
+@dataclass(frozen=True)
+class Texture:
+    """What draws of one texture share, noise of images and beam hardening; a `validation.batch.engine.Part`."""
+
+    scenario: Scenario
+    first: First
+
+    @cached_property
+    def name(self) -> str:
+        """Return its file in the shared folder: a digest of what it depends on."""
+        return f"texture-{digest(self.scenario.model_dump_json(), self.first.name)}.kept"
+
+    def needs(self) -> tuple[Part, ...]:
+        """Return the clean stacks from which the counts are made, and the first draw."""
+        return *clean_parts(self.scenario), self.first
+
+    def make(self, shared: Path) -> None:
+        """Simulate it, and propagate the noise of its images, unless that is there."""
+        if read_arrays(shared / self.name) is not None:
+            return
+        measurement, _ = self.first.read(shared)
+        with simulated(self.scenario, shared) as (experiment, _, _):
+            polynomial = set_up(experiment, _options_of(measurement)).calibration.polynomial
+            fitted = _with_polynomial(measurement, polynomial)
+            opened = ready(experiment, fitted, self.first.options)
+            noise = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude).noise
+        arrays = {"systematic": noise.systematic, "polynomial": np.array(polynomial)}
+        for group, values in (("own", noise.own), ("part", noise.parts)):
+            arrays |= {f"{group}:{name}": value for name, value in values.items()}
+        write_arrays(shared / self.name, arrays)
+
+    def read(self, shared: Path) -> tuple[Measurement, Propagated]:
+        """Return the first draw's measurement, with this texture's polynomial, and the noise of the images."""
+        self.make(shared)
+        known, (measurement, _) = _grouped(shared / self.name), self.first.read(shared)
+        c1, c2, c3 = known["polynomial"].tolist()
+        noise = Propagated(parts=known["part"], own=known["own"], systematic=known["systematic"])
+        return _with_polynomial(measurement, (c1, c2, c3)), noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,42 +141,53 @@ class Draw:
     """One draw of a scenario whose law is identified; a `validation.batch.engine.Run`."""
 
     scenario: Scenario
-    options: IdentifyOptions
+    texture: Texture
+
+    @property
+    def options(self) -> IdentifyOptions:
+        """Return what is identified."""
+        return self.texture.first.options
 
     @cached_property
     def key(self) -> str:
         """Return a digest of all that the result depends on."""
         return digest(
             self.scenario.model_dump_json(exclude={"name", "title", "material"}),
-            self.options,
+            self.texture.name,
             software("pdvc", "simulator", "validation"),
         )
 
     @property
     def columns(self) -> Mapping[str, Scalar]:
         """Return what says which run this is."""
-        return {"scenario": self.scenario.name, "law": self.options.law.kind, "repetition": self.scenario.repetition}
+        return {
+            "scenario": self.scenario.name,
+            "law": self.options.law.kind,
+            "texture": self.scenario.seed,
+            "repetition": self.scenario.repetition,
+        }
 
     @property
     def score_columns(self) -> Mapping[str, type]:
         """Return names and types of the scores."""
         names = tuple(self.options.law.values())
-        return {
-            f"{method}:{name}{what}": float for method in METHODS for name in names for what in ("", "_deviation")
-        } | {"area_error": float, **{f"seconds_{method}": float for method in (*METHODS, "ready")}}
+        found = (f"{method}:{name}{what}" for method in METHODS for name in names for what in ("", "_deviation"))
+        others = ("area_error", "share", "share_deviation", *(f"seconds_{part}" for part in (*METHODS, "ready")))
+        return dict.fromkeys((*found, *others), float)
 
     def parts(self) -> tuple[Part, ...]:
-        """Return the clean stacks, and the first draw."""
-        return *clean_parts(self.scenario), First(self.scenario, self.options)
+        """Return the clean stacks, and what its texture's draws share."""
+        return *clean_parts(self.scenario), self.texture
 
     def carry_out(self, shared: Path) -> Result:
         """Simulate, make ready and identify by every method; logarithms and their deviations are the scores."""
-        measurement, first = First(self.scenario, self.options).read(shared)
+        measurement, noise = self.texture.read(shared)
+        _, first = self.texture.first.read(shared)
         with simulated(self.scenario, shared) as (experiment, _, _):
-            return Result(scores=self._identified(experiment, measurement, first))
+            return Result(scores=self._identified(experiment, measurement, noise, first))
 
     def _identified(
-        self, experiment: Experiment, measurement: Measurement, first: dict[str, Any]
+        self, experiment: Experiment, measurement: Measurement, noise: Propagated, first: dict[str, Any]
     ) -> dict[str, Scalar]:
         took: dict[str, float] = {}
         clock = time.perf_counter()
@@ -153,7 +198,6 @@ class Draw:
             took[part], clock = now - clock, now
 
         opened = ready(experiment, measurement, self.options)
-        noise = Propagated(parts=first["part"], own=first["own"], systematic=first["systematic"])
         radiographs = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude, noise)
         note("ready")
         amplitude, covariance, _ = free_motion(radiographs, Deviations(**first["free"]))
@@ -176,6 +220,7 @@ class Draw:
                 scores[f"{method}:{name}"] = float(estimate.vector[k])
                 scores[f"{method}:{name}_deviation"] = float(deviation[k])
         scores["area_error"] = self._area_error(opened)
+        scores["share"], scores["share_deviation"] = law.share
         return scores
 
     def _area_error(self, opened: Ready) -> float:
@@ -186,10 +231,44 @@ class Draw:
         return float(opened.model.profile.area_mm2.min() / true - 1)
 
 
-def draws(scenario: Scenario, options: IdentifyOptions, count: int) -> list[Draw]:
-    """Return draws of a scenario, their noise numbered from 1; the crosshead's rate is told."""
+def draws(scenario: Scenario, options: IdentifyOptions, count: int, textures: int = 1) -> list[Draw]:
+    """Return draws of a scenario, their noise numbered from 1, in equal parts of some textures.
+
+    The first texture is the scenario's own; the crosshead's rate is told.
+    """
     told = options.model_copy(update={"stroke_mm_per_s": scenario.loading.stroke_mm_per_s})
-    return [Draw(scenario=scenario.model_copy(update={"repetition": n}), options=told) for n in range(1, count + 1)]
+    first, found = First(scenario, told), []
+    for n in range(count):
+        seed = scenario.seed + n * textures // count
+        of_texture = scenario.model_copy(update={"seed": seed, "repetition": 0})
+        found.append(
+            Draw(scenario=of_texture.model_copy(update={"repetition": n + 1}), texture=Texture(of_texture, first))
+        )
+    return found
+
+
+def _grouped(path: Path) -> dict[str, Any]:
+    """Return kept arrays, those named ``group:name`` by groups."""
+    kept = read_arrays(path)
+    assert kept is not None, "it was made"
+    groups: dict[str, Any] = {}
+    for name, value in kept.items():
+        group, _, rest = name.partition(":")
+        if rest:
+            groups.setdefault(group, {})[rest] = value
+        else:
+            groups[name] = value
+    return groups
+
+
+def _options_of(measurement: Measurement) -> MeasureOptions:
+    return MeasureOptions.parse(tomllib.loads(measurement.provenance.options), where="first draw")
+
+
+def _with_polynomial(measurement: Measurement, polynomial: tuple[float, float, float]) -> Measurement:
+    """Return a measurement whose options tell the beam-hardening polynomial."""
+    told = _options_of(measurement).model_copy(update={"beam_hardening": polynomial})
+    return replace(measurement, provenance=replace(measurement.provenance, options=told.template()))
 
 
 def _covariances(measurement: Measurement, opened: Ready) -> Floats:
