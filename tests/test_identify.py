@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pdvc.experiment import Series
 from pdvc.history import Angle, time_basis
 from pdvc.identify.beam import elongation_mm
 from pdvc.identify.carried import Carrier, shift_of
+from pdvc.identify.choice import Choices, choices
 from pdvc.identify.crosshead import from_crosshead
 from pdvc.identify.expected import assumed, slower_near_yield, unloading
 from pdvc.identify.integrated import Radiographs, expected_covariance, free_motion, integrated, log_evidence
@@ -337,3 +339,32 @@ def test_the_share_that_e_is_wrong_by_is_found_and_does_not_move_the_law():
     # what is not known of e is in the covariance, and told as its part
     assert 0 < found.by_source["systematic"][1, 1] < found.estimate.covariance[1, 1]
     assert (np.diag(found.estimate.covariance)[1:4] > np.diag(plain.estimate.covariance)[1:4]).all()
+
+
+def test_made_up_tests_are_told_apart_where_laws_differ_much_and_the_one_asked_for_is_doubted():
+    model = _model()
+    vector = _truth(model)
+    radiographs, force = _radiographs(model, vector, np.random.default_rng(8))
+    found = integrated(model, force, vector, radiographs, rounds=1)
+    observed = np.ones(len(BASIS.height_mm), dtype=bool)
+    opened = SimpleNamespace(
+        model=model,
+        force_N=force,
+        amplitude=radiographs.amplitude,
+        loaded=LOADED,
+        seen=seen_motions(BASIS, observed),
+        sections=len(observed),
+    )
+    result = choices(opened, radiographs, found, ("voce", "ludwik"), 1)
+    assert result.kinds == ("ludwik", "voce")
+    np.testing.assert_array_equal(result.chosen(), [[1, 0], [0, 1]])
+    assert result.error_rate() == 0
+    np.testing.assert_array_equal(result.doubted(), [0, 1])
+
+
+def test_wrong_choices_are_counted():
+    evidence = np.array([[[0.0, -1.0], [-5.0, 0.0]], [[0.0, -1.0], [-9.0, 0.0]]])
+    result = Choices(kinds=("ludwik", "swift"), log_evidence=evidence)
+    np.testing.assert_array_equal(result.chosen(), [[1, 1], [1, 1]])
+    assert result.error_rate() == 0.5
+    np.testing.assert_array_equal(result.doubted(), [0.5, 0.5])

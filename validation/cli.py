@@ -39,7 +39,7 @@ def _common(
 for _command in (
     *(one.scenarios, one.options, one.simulate, one.inspect, one.measure, one.score, one.report, one.run),
     *(many.compare, many.studies, many.study, many.plan),
-    *(identifying.identify, identifying.identify_draws),
+    *(identifying.identify, identifying.identify_draws, identifying.identify_choice),
     *(live.prepare, live.live, live.play),
     *(watching.page, watching.watch),
     doors.export,

@@ -139,7 +139,7 @@ def integrated(
     known = deviations or radiographs.spaces[0].first_guess()
     try:
         with one_thread():
-            settled = _settled(model, force_N, start, radiographs, radiographs.spaces[1], known, asked)
+            settled = _settled(model, force_N, start, radiographs, known, asked)
             return _summed(model, settled, radiographs)
     except np.linalg.LinAlgError as error:
         raise ValueError(
@@ -175,17 +175,31 @@ def free_motion(radiographs: Radiographs, deviations: Deviations | None = None) 
 def log_evidence(
     model: Model, force_N: Floats, start: Floats, radiographs: Radiographs, deviations: Deviations
 ) -> float:
-    """Return the logarithm of a law's evidence, up to a constant, for deviations of the process found before.
+    """Return the logarithm of a law's evidence, up to a constant, for deviations of the process found before."""
+    return likeliest(model, force_N, start, radiographs, deviations)[1]
 
-    With few modes of whatever moves beside the law: the constant is another one than with all.
+
+def likeliest(
+    model: Model, force_N: Floats, start: Floats, radiographs: Radiographs, deviations: Deviations
+) -> tuple[Floats, float]:
+    """Return the unknowns (unknown,) of the largest posterior for given deviations, and the log of the law's evidence.
+
+    Where no motion is likely under the law, those to start from, and minus infinity.
     """
     with one_thread():
         try:
-            few = radiographs.spaces[0]
-            return _log_evidence(_settled(model, force_N, start, radiographs, few, deviations, 0), few)
+            settled = _settled(model, force_N, start, radiographs, deviations, 0)
         except np.linalg.LinAlgError:
-            # no motion is likely under the law
-            return -np.inf
+            return start, -np.inf
+        return settled.vector, _log_evidence(settled, radiographs.spaces[1])
+
+
+def refitted(
+    model: Model, force_N: Floats, start: Floats, radiographs: Radiographs, deviations: Deviations
+) -> Deviations:
+    """Return the deviations of the process beside a law, sought once more."""
+    with one_thread():
+        return _settled(model, force_N, start, radiographs, deviations, 1).deviations
 
 
 def _settled(
@@ -193,32 +207,36 @@ def _settled(
     force_N: Floats,
     start: Floats,
     radiographs: Radiographs,
-    space: StateSpace,
     known: Deviations,
     rounds: int,
 ) -> _Settled:
-    """Go from a start to the unknowns of the largest posterior; deviations are sought in some rounds."""
-    vector, lying = start, force_N
+    """Go from a start to the unknowns of the largest posterior; deviations are sought in some rounds.
+
+    They are sought with few modes, which cannot follow the law's columns: about the unknowns so far, then, and not
+    about the prior's mean.
+    """
+    few, space = radiographs.spaces
+    vector, lying, share = start, force_N, 0.0
     for _ in range(MOST_STEPS):
         about = _About.at(model, vector, lying, force_N, radiographs)
         if rounds:
-            few = Process(radiographs.spaces[0].with_trend(about.columns), about.seen)
+            near = Process(few.with_trend(about.columns), about.near(vector - model.unknowns.mean, share))
             # half of the rounds at first, and one each time that the unknowns have moved
             now = max(rounds // 2, 1)
-            known, rounds = few.fitted(known, now), rounds - now
-        process = Process(space.with_trend(about.columns_in(space)), about.seen)
+            known, rounds = near.fitted(known, now), rounds - now
+        process = Process(space.with_trend(about.every_column), about.seen)
         smoothed = process.smoothed(known)
         scaled = _OfUnknowns(process, about.scale)
         found = model.unknowns.mean + smoothed.trend[-len(start) :] * about.scale
         deviation = scaled.deviation(smoothed)
         limit = np.minimum(LONGEST_STEP, LONGEST_STEP * model.unknowns.deviation)
-        share = min(1.0, float(np.min(limit / np.maximum(np.abs(found - vector), 1e-300))))
+        step = min(1.0, float(np.min(limit / np.maximum(np.abs(found - vector), 1e-300))))
         change = found - vector
         if np.abs(change / deviation).max() > FAR:
-            share = _shortened(model, vector, change, share, lying, force_N, radiographs, space, known)
-        vector = vector + share * change
-        lying = about.force(process, smoothed, known)
-        if share == 1.0 and np.abs(change / deviation).max() < SETTLED and not rounds:
+            step = _shortened(model, vector, change, step, lying, force_N, radiographs, known)
+        vector = vector + step * change
+        lying, share = about.force(process, smoothed, known), float(smoothed.trend[-len(start) - 1])
+        if step == 1.0 and np.abs(change / deviation).max() < SETTLED and not rounds:
             break
     return _Settled(
         vector=vector, force_N=lying, about=about, process=scaled, motion=process, smoothed=smoothed, deviations=known
@@ -233,7 +251,6 @@ def _shortened(
     lying: Floats,
     force_N: Floats,
     radiographs: Radiographs,
-    space: StateSpace,
     known: Deviations,
 ) -> float:
     """Return the share of a change, halved as often as it takes, at which the posterior is no smaller than before."""
@@ -242,6 +259,7 @@ def _shortened(
         about = _About.at(model, trial, lying, force_N, radiographs)
         moved = about.columns @ ((trial - model.unknowns.mean) / about.scale)
         left = about.seen.data - np.einsum("tnm,tm->tn", about.seen.design, moved)
+        space = radiographs.spaces[1].with_trend(about.believed)
         likely = Process(space, replace(about.seen, data=left)).smoothed(known).log_likelihood
         away = (trial - model.unknowns.mean) / model.unknowns.deviation
         return float(likely + np.linalg.slogdet(about.white)[1].sum() - away @ away / 2)
@@ -311,10 +329,15 @@ class _About:
             own=own,
         )
 
-    def columns_in(self, space: StateSpace) -> Floats:
-        """Return all columns, that of e first, where a space has the modes to follow it; else J alone."""
-        unknowns, states = space.to_amplitude.shape
-        return self.columns if states < unknowns else np.concatenate([self.believed, self.columns], axis=2)
+    @property
+    def every_column(self) -> Floats:
+        """Return all columns, that of e first."""
+        return np.concatenate([self.believed, self.columns], axis=2)
+
+    def near(self, away: Floats, share: float) -> Seen:
+        """Return the data less what unknowns (unknown,), away from the mean of their prior, and a share of e make."""
+        moved = self.columns @ (away / self.scale) + share * self.believed[..., 0]
+        return replace(self.seen, data=self.seen.data - np.einsum("tnm,tm->tn", self.seen.design, moved))
 
     def force(self, process: Process, smoothed: Smoothed, deviations: Deviations) -> Floats:
         """Return the forces (step,) that are likeliest under all data, N."""

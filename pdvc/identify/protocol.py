@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pdvc.experiment import Experiment
 from pdvc.identify.beam import elongation_mm
+from pdvc.identify.choice import Choices, choices
 from pdvc.identify.crosshead import from_crosshead
 from pdvc.identify.integrated import Identified, Radiographs, carried_by, integrated, log_evidence, radiographs_at
 from pdvc.identify.laws import law_named
@@ -92,6 +93,28 @@ def identify(
         seconds=clock.seconds,
         versions=versions(),
     )
+
+
+def choice(
+    experiment: Experiment,
+    measurement: Measurement,
+    options: IdentifyOptions,
+    draws: int,
+    *,
+    work: Path | None = None,
+    progress: Progress = silent,
+) -> Choices:
+    """Return how the choice among the law and those it is compared with turns out in made-up tests like this one.
+
+    Raises ValueError as `identify` does, and where no law is compared.
+    """
+    if not options.compare:
+        raise ValueError("compare: expected some laws to choose among, found none")
+    opened = ready(experiment, measurement, options, work=work, progress=progress)
+    flat = zeroed(opened.amplitude, opened.loaded)
+    start = unweighted(opened.model, flat, opened.seen, opened.force_N, opened.sections).vector
+    found, radiographs = _integrated(opened, start)
+    return choices(opened, radiographs, found, options.compare, draws, progress=progress)
 
 
 class _Clock:

@@ -161,6 +161,48 @@ def identify_draws(
     tell(f"table: {out / 'recovery.csv'}")
 
 
+def identify_choice(
+    experiment: ExperimentFolder,
+    measurement: Annotated[
+        Path, typer.Option("--measurement", metavar="FILE", help="A measurement of this experiment.")
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="CSV", help="The log evidence of each law in each made-up test.")
+    ],
+    draws: Annotated[int, typer.Option("--draws", min=1, metavar="N", help="Made-up tests of each law.")] = 10,
+    law: Laws = None,
+    options: Annotated[
+        Path | None,
+        typer.Option("--identify-options", metavar="TOML", help="All options of an identification; those above win."),
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Tell how often the choice among laws would be right in a test like this one.
+
+    Of each law, the one that explains the test best makes radiographs and forces with this test's noise; the largest
+    evidence then chooses among all, and the law asked for (the first) is doubted as in an identification.
+
+    Example:  `pdvc-bench identify-choice out/quick/experiment --measurement out/quick/measurement.nc -o choice.csv`
+    """
+    with answering() as progress:
+        from pdvc.experiment import read_experiment
+        from pdvc.identify.options import IdentifyOptions
+        from pdvc.identify.protocol import choice
+        from pdvc.measurement_file import read_measurement
+        from validation.identify.tables import choice_csv, choice_rows
+        from validation.job import write_text
+
+        asked = options_of(IdentifyOptions() if options is None else IdentifyOptions.read(options), law, None, None)
+        use_threads(threads)
+        found = choice(read_experiment(experiment), read_measurement(measurement), asked, draws, progress=progress)
+        write_text(out, choice_csv(found))
+    from rich.console import Console
+
+    Console().print(_table(["true law", *found.kinds, f"{found.kinds[0]} doubted"], choice_rows(found)))
+    tell(f"wrong choices: {found.error_rate():.0%} of {found.log_evidence[..., 0].size}")
+    tell(f"table: {out}")
+
+
 def tell_planned_law(scenario: str, law: str, options: str, out: Path | None, threads: int | None) -> None:
     """Tell how well the parameters of a law would be known of a test that is still to be made."""
     with answering() as progress:
