@@ -245,7 +245,15 @@ def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
     assert "did you mean 'noise'?" in only_line(result)
 
 
-RUNS = {"noise": 80, "views-per-turn": 60, "sections": 60, "coverage": 60, "capture": 45, "resolution": 90}
+RUNS = {
+    "noise": 80,
+    "views-per-turn": 60,
+    "sections": 60,
+    "coverage": 60,
+    "capture": 45,
+    "resolution": 90,
+    "identification": 16,
+}
 
 
 @pytest.mark.parametrize(("name", "runs"), RUNS.items())

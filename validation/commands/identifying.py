@@ -19,10 +19,16 @@ from validation.commands.parts import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import pandas as pd
     from rich.table import Table
 
     from pdvc.identify.options import IdentifyOptions
+    from pdvc.progress import Progress
     from simulator.scenario import Scenario
+    from validation.batch.trial import Trial
+    from validation.study.description import Study
 
 Laws = Annotated[
     list[str] | None,
@@ -153,8 +159,7 @@ def identify_draws(
             write_text(out / "recovery.csv", found.to_csv(index=False))
     from rich.console import Console
 
-    rows = [[f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in row] for row in found.values.tolist()]
-    Console().print(_table(list(found.columns), rows))
+    Console().print(_table(list(found.columns), _cells(found)))
     failed = int((table["status"] != "done").sum())
     if failed:
         tell(f"{failed} of {len(table)} draws failed: see {out / 'failed'}")
@@ -201,6 +206,36 @@ def identify_choice(
     Console().print(_table(["true law", *found.kinds, f"{found.kinds[0]} doubted"], choice_rows(found)))
     tell(f"wrong choices: {found.error_rate():.0%} of {found.log_evidence[..., 0].size}")
     tell(f"table: {out}")
+
+
+def study_of_laws(
+    study: Study,
+    trials: Sequence[Trial],
+    out: Path,
+    scheduler: str | None,
+    workers: int | None,
+    progress: Progress,
+) -> None:
+    """Carry out a study whose runs identify laws, and tell what was recovered and said of them."""
+    from pdvc.lock import held
+    from validation.batch.engine import run_trials
+    from validation.identify.study import identified_trials, recovery_of
+    from validation.job import write_text
+
+    runs = identified_trials(study, trials)
+    with held(out):
+        table = run_trials(runs, out, scheduler=scheduler, workers=workers, progress=progress)
+        recovered, said = recovery_of(study, trials, table)
+        for name, frame in (("table", table), ("recovery", recovered), ("laws", said)):
+            write_text(out / f"{name}.csv", frame.to_csv(index=False))
+    from rich.console import Console
+
+    for frame in (recovered, said):
+        Console().print(_table(list(frame.columns), _cells(frame)))
+    failed = int((table["status"] != "done").sum())
+    if failed:
+        tell(f"{failed} of {len(table)} runs failed: see {out / 'failed'}")
+    tell(f"tables: {out / 'recovery.csv'}, {out / 'laws.csv'}")
 
 
 def tell_planned_law(scenario: str, law: str, options: str, out: Path | None, threads: int | None) -> None:
@@ -257,6 +292,11 @@ def options_of(
     if until is not None:
         changes["until"] = until
     return options.model_copy(update=changes)
+
+
+def _cells(frame: pd.DataFrame) -> list[list[str]]:
+    """Return the cells of a table as text."""
+    return [[f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in row] for row in frame.values.tolist()]
 
 
 def _table(headings: list[str], rows: list[list[str]]) -> Table:
