@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from pdvc.geometry import ConeBeam
-from pdvc.identify.faces import SUBPIXELS, Scan, appearance, areas_between_faces, blur_of, paths_mm
+from pdvc.identify.faces import SUBPIXELS, Scan, appearance, areas_between_faces, blur_of, paths_mm, seen_by_pixels
 from pdvc.identify.outline import areas_of, directions_rad, outline_of
 from pdvc.reconstruction import fdk
 from pdvc.volume import Grid, Hull, Volume
@@ -91,3 +91,14 @@ def test_paths_through_a_polygon_are_those_between_the_faces_of_a_box():
     c, s = np.cos(TURNED_RAD), np.sin(TURNED_RAD)
     found = paths_mm(corner @ np.array([[c, s], [-s, c]]), SCANNER, ANGLE_RAD)
     np.testing.assert_allclose(found, _box_paths(SUBPIXELS), atol=1e-9)
+
+
+@pytest.mark.parametrize("jump", [0.2, 1.0, 2.5])
+def test_a_face_seen_edge_on_moves_in_as_its_closed_form_says(jump):
+    """The mean, over where in a pixel the face is, of what the pixel lacks: 1/2 coth(a / 2) - 1 / a of a."""
+    behind = np.arange(SUBPIXELS + 1)[:, None]
+    grey = jump * (np.arange(SUBPIXELS) < behind)
+    scan = Scan(geometry=SCANNER, angle_rad=ANGLE_RAD, polynomial=(1.0, 0.0, 0.0))
+    seen = seen_by_pixels(grey, scan, 0.0)[:, 0] / jump
+    lacking = 0.5 - np.trapezoid(seen, dx=1 / SUBPIXELS)
+    assert lacking == pytest.approx(0.5 / np.tanh(jump / 2) - 1 / jump, rel=0.02)

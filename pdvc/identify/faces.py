@@ -87,7 +87,7 @@ def appearance(radius_mm: Floats, level: float, scan: Scan, blur_px: float) -> t
     geometry = replace(scan.geometry, rows=_ROWS, row_shift_mm=0.0, roll_rad=0.0)
     angle = directions_rad()
     corner = radius_mm[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    lines = _seen(level * paths_mm(corner, geometry, scan.angle_rad), scan, blur_px)
+    lines = seen_by_pixels(level * paths_mm(corner, geometry, scan.angle_rad), scan, blur_px)
 
     def view(i: int) -> Image:
         image = smoothed(np.tile(lines[i], (_ROWS, 1)), scan.smooth_px)
@@ -130,7 +130,7 @@ def paths_mm(corner_mm: Floats, geometry: ConeBeam, angle_rad: Floats) -> Floats
     return np.abs(total).reshape(len(angle_rad), rays)
 
 
-def _seen(grey: Floats, scan: Scan, blur_px: float) -> Image:
+def seen_by_pixels(grey: Floats, scan: Scan, blur_px: float) -> Image:
     """Return the grey levels of pixels (view, column) whose rays alone would show some (view, ray)."""
     attenuation = _attenuation(grey, scan.polynomial)
     intensity = np.exp(-attenuation)
