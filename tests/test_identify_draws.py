@@ -19,9 +19,9 @@ from validation.testing.small_cases import small_options, small_scenario
 
 
 def test_a_draw_scores_every_method_and_other_noise_and_texture_move_all_of_them(tmp_path):
-    one, other = draws(small_scenario({"discarded_rows": 15}), IdentifyOptions(), 2, textures=2)
+    one, other = draws(small_scenario({"discarded_rows": 15}), IdentifyOptions(), 2)
     assert one.key != other.key
-    assert [draw.columns["texture"] for draw in (one, other)] == [0, 1]
+    assert [draw.columns["texture"] for draw in (one, other)] == [1, 2]
     first, second = one.carry_out(tmp_path).scores, other.carry_out(tmp_path).scores
     assert set(first) == set(one.score_columns)
     for method in METHODS:

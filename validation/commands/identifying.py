@@ -123,16 +123,13 @@ def identify(
 def identify_draws(
     scenario: ScenarioName,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
-    draws: Annotated[int, typer.Option("--draws", min=1, metavar="N", help="Draws of the noise, in all.")] = 50,
-    textures: Annotated[
-        int, typer.Option("--textures", min=1, metavar="N", help="Textures that they are spread over.")
-    ] = 10,
+    draws: Annotated[int, typer.Option("--draws", min=1, metavar="N", help="Draws of noise and texture.")] = 50,
     law: Laws = None,
     workers: Workers = None,
 ) -> None:
     """Identify the law of many draws of a scenario by every method: bias, random error, coverage, time.
 
-    Draws have other noise, and textures other nodules, of the same sample, motion and law.
+    Each draw has other noise and other nodules, and the same shape, motion and law.
 
     Writes a row for each draw as soon as it is finished, and at the end DIR/table.csv and DIR/recovery.csv.
     Interrupted, it goes on where it was when the same command is given again.
@@ -151,9 +148,7 @@ def identify_draws(
         chosen = load_scenario(scenario)
         asked = options_of(IdentifyOptions(), law or ["ludwik"], None, None)
         with held(out):
-            table = run_trials(
-                draws_of(chosen, asked, draws, min(textures, draws)), out, workers=workers, progress=progress
-            )
+            table = run_trials(draws_of(chosen, asked, draws), out, workers=workers, progress=progress)
             found = recovery(table, chosen)
             write_text(out / "table.csv", table.to_csv(index=False))
             write_text(out / "recovery.csv", found.to_csv(index=False))

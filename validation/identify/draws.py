@@ -1,23 +1,21 @@
-"""One draw of an identification study: other noise of all images and forces, and every few draws another texture.
+"""One draw of an identification study: another texture, other noise of all images and forces, the same motion and law.
 
 What intervals hold beside noise, as what re-projection leaves of the texture, does not differ from one draw of noise
-to the next: a coverage of these alone would be that of one texture's luck. So several textures (`Texture`) have some
-draws of noise each, with the same sample, motion and law.
+to the next: a coverage of these alone would be that of one texture's luck. So each draw is another sample of nodules,
+of the same shape.
 
-The first texture is measured in full (`First`, a part that all draws share), and tells the deviations of the processes
-to start from. A texture has its own covariance of noise and beam-hardening polynomial, found once. Each draw is then
-made ready by itself, counts, volume, areas, pattern and pass, at the motion that the first one found: the true motion
-is the same, and what draws differ by is far within what is linear. Its own motion, for the two-step methods, is one
-step of the smoother from there; the integrated identification seeks its process's deviations once more, from those of
-the first.
+The first one is measured in full (`First`, a part that all draws share), and tells the deviations of the processes to
+start from. Each draw is made ready by itself, counts, volume, areas, pattern, noise and pass, at the motion that the
+first one found: the true motion is the same, and what draws differ by is far within what is linear. Its own motion,
+for the two-step methods, is one step of the smoother from there; the integrated identification seeks its process's
+deviations once more, from those of the first.
 """
 
 from __future__ import annotations
 
 import time
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -35,10 +33,8 @@ from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, WEIGHTED
 from pdvc.identify.two_step import Estimate
 from pdvc.measurement import Measurement
 from pdvc.measurement_file import read_measurement, write_measurement
-from pdvc.noise import Propagated
-from pdvc.options import DEFAULT, MeasureOptions
+from pdvc.options import DEFAULT
 from pdvc.protocol import measure
-from pdvc.setup import set_up
 from pdvc.smoother import Smoother
 from pdvc.state_space import Deviations
 from pdvc.store import read_arrays, write_arrays
@@ -96,64 +92,24 @@ class First:
         return read_measurement(shared / self.name / "measurement.nc"), groups
 
 
-@dataclass(frozen=True)
-class Texture:
-    """What draws of one texture share, noise of images and beam hardening; a `validation.batch.engine.Part`."""
-
-    scenario: Scenario
-    first: First
-
-    @cached_property
-    def name(self) -> str:
-        """Return its file in the shared folder: a digest of what it depends on."""
-        return f"texture-{digest(self.scenario.model_dump_json(), self.first.name)}.kept"
-
-    def needs(self) -> tuple[Part, ...]:
-        """Return the clean stacks from which the counts are made, and the first draw."""
-        return *clean_parts(self.scenario), self.first
-
-    def make(self, shared: Path) -> None:
-        """Simulate it, and propagate the noise of its images, unless that is there."""
-        if read_arrays(shared / self.name) is not None:
-            return
-        measurement, _ = self.first.read(shared)
-        with simulated(self.scenario, shared) as (experiment, _, _):
-            polynomial = set_up(experiment, _options_of(measurement)).calibration.polynomial
-            fitted = _with_polynomial(measurement, polynomial)
-            opened = ready(experiment, fitted, self.first.options)
-            noise = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude).noise
-        arrays = {"systematic": noise.systematic, "polynomial": np.array(polynomial)}
-        for group, values in (("own", noise.own), ("part", noise.parts)):
-            arrays |= {f"{group}:{name}": value for name, value in values.items()}
-        write_arrays(shared / self.name, arrays)
-
-    def read(self, shared: Path) -> tuple[Measurement, Propagated]:
-        """Return the first draw's measurement, with this texture's polynomial, and the noise of the images."""
-        self.make(shared)
-        known, (measurement, _) = _grouped(shared / self.name), self.first.read(shared)
-        c1, c2, c3 = known["polynomial"].tolist()
-        noise = Propagated(parts=known["part"], own=known["own"], systematic=known["systematic"])
-        return _with_polynomial(measurement, (c1, c2, c3)), noise
-
-
 @dataclass(frozen=True, kw_only=True)
 class Draw:
     """One draw of a scenario whose law is identified; a `validation.batch.engine.Run`."""
 
     scenario: Scenario
-    texture: Texture
+    first: First
 
     @property
     def options(self) -> IdentifyOptions:
         """Return what is identified."""
-        return self.texture.first.options
+        return self.first.options
 
     @cached_property
     def key(self) -> str:
         """Return a digest of all that the result depends on."""
         return digest(
             self.scenario.model_dump_json(exclude={"name", "title", "material"}),
-            self.texture.name,
+            self.first.name,
             software("pdvc", "simulator", "validation"),
         )
 
@@ -176,18 +132,17 @@ class Draw:
         return dict.fromkeys((*found, *others), float)
 
     def parts(self) -> tuple[Part, ...]:
-        """Return the clean stacks, and what its texture's draws share."""
-        return *clean_parts(self.scenario), self.texture
+        """Return the clean stacks, and the first draw."""
+        return *clean_parts(self.scenario), self.first
 
     def carry_out(self, shared: Path) -> Result:
         """Simulate, make ready and identify by every method; logarithms and their deviations are the scores."""
-        measurement, noise = self.texture.read(shared)
-        _, first = self.texture.first.read(shared)
+        measurement, first = self.first.read(shared)
         with simulated(self.scenario, shared) as (experiment, _, _):
-            return Result(scores=self._identified(experiment, measurement, noise, first))
+            return Result(scores=self._identified(experiment, measurement, first))
 
     def _identified(
-        self, experiment: Experiment, measurement: Measurement, noise: Propagated, first: dict[str, Any]
+        self, experiment: Experiment, measurement: Measurement, first: dict[str, Any]
     ) -> dict[str, Scalar]:
         took: dict[str, float] = {}
         clock = time.perf_counter()
@@ -198,7 +153,7 @@ class Draw:
             took[part], clock = now - clock, now
 
         opened = ready(experiment, measurement, self.options)
-        radiographs = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude, noise)
+        radiographs = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude)
         note("ready")
         amplitude, covariance, _ = free_motion(radiographs, Deviations(**first["free"]))
         found: dict[str, Estimate] = opened.two_steps(amplitude, covariance, first["vector"])
@@ -231,20 +186,12 @@ class Draw:
         return float(opened.model.profile.area_mm2.min() / true - 1)
 
 
-def draws(scenario: Scenario, options: IdentifyOptions, count: int, textures: int = 1) -> list[Draw]:
-    """Return draws of a scenario, their noise numbered from 1, in equal parts of some textures.
-
-    The first texture is the scenario's own; the crosshead's rate is told.
-    """
+def draws(scenario: Scenario, options: IdentifyOptions, count: int) -> list[Draw]:
+    """Return draws of a scenario, noise and textures numbered from its own; the crosshead's rate is told."""
     told = options.model_copy(update={"stroke_mm_per_s": scenario.loading.stroke_mm_per_s})
-    first, found = First(scenario, told), []
-    for n in range(count):
-        seed = scenario.seed + n * textures // count
-        of_texture = scenario.model_copy(update={"seed": seed, "repetition": 0})
-        found.append(
-            Draw(scenario=of_texture.model_copy(update={"repetition": n + 1}), texture=Texture(of_texture, first))
-        )
-    return found
+    first = First(scenario, told)
+    changes = ({"seed": scenario.seed + n, "repetition": n} for n in range(1, count + 1))
+    return [Draw(scenario=scenario.model_copy(update=each), first=first) for each in changes]
 
 
 def _grouped(path: Path) -> dict[str, Any]:
@@ -259,16 +206,6 @@ def _grouped(path: Path) -> dict[str, Any]:
         else:
             groups[name] = value
     return groups
-
-
-def _options_of(measurement: Measurement) -> MeasureOptions:
-    return MeasureOptions.parse(tomllib.loads(measurement.provenance.options), where="first draw")
-
-
-def _with_polynomial(measurement: Measurement, polynomial: tuple[float, float, float]) -> Measurement:
-    """Return a measurement whose options tell the beam-hardening polynomial."""
-    told = _options_of(measurement).model_copy(update={"beam_hardening": polynomial})
-    return replace(measurement, provenance=replace(measurement.provenance, options=told.template()))
 
 
 def _covariances(measurement: Measurement, opened: Ready) -> Floats:
