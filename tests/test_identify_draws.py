@@ -29,8 +29,8 @@ def test_a_draw_scores_every_method_and_other_noise_and_texture_move_all_of_them
             assert np.isfinite(first[f"{method}:{name}"])
             assert first[f"{method}:{name}_deviation"] > 0
         assert first[f"{method}:hardening_MPa"] != second[f"{method}:hardening_MPa"]
-    # a pixel is a seventh of this sample, and nodules are three: faces are found a third of a pixel too far inside
-    assert abs(first["area_error"]) < 0.25
+    # a pixel is a tenth of this sample, and nodules are three, which dent its faces
+    assert abs(first["area_error"]) < 0.15
 
 
 def test_coverage_bias_and_random_error_are_those_of_the_draws():
