@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -26,11 +26,11 @@ from pdvc.equations import Equations, check_size, linearise, residuals
 from pdvc.experiment import Experiment
 from pdvc.history import settled
 from pdvc.measurement import Fit, MeasuredMotion, Measurement, Provenance, Stage
-from pdvc.noise import Noise, Propagated, known_from_residual, propagate
+from pdvc.noise import Noise, Propagated, propagate
 from pdvc.options import DEFAULT, MeasureOptions, ResolvedStage, check_discarded
 from pdvc.outliers import ROUNDS, outliers, unchanged
-from pdvc.pattern import fixed_pattern
-from pdvc.preparation import Prepared, noise_of, prepare, snr_of, snr_reprojection
+from pdvc.pattern import Pattern
+from pdvc.preparation import Prepared, prepare, snr_of, snr_reprojection
 from pdvc.progress import Progress, silent
 from pdvc.residual_tests import residual_tests
 from pdvc.result_checks import check_finite, doubts_of_result, doubts_of_spots
@@ -41,6 +41,7 @@ from pdvc.threads import one_thread
 from pdvc.uncertainty import posterior, stated
 from pdvc.verdict import Stop, Verdict, explained_by
 from pdvc.volume import Volume
+from pdvc.without_pattern import Cleared, without_pattern
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -265,20 +266,17 @@ class _Protocol:
     def _remove_pattern(self, basis: SectionBasis, found: _Found) -> None:
         """Take the detector's fixed pattern from all images of scale 1, if the options say so and noise is known."""
         fine = self.prepared[1]
-        noise = noise_of(self._setup, fine.systematic)
-        if not self._setup.options.remove_pattern or noise is None:
-            return
-        known: Noise = noise
-
-        def pattern() -> dict[str, NDArray[np.float32]]:
-            amplitude = np.einsum("ft,fjk->tjk", found.time_functions, found.coefficients)
-            rho = residuals(fine.images, basis, amplitude, progress=self._progress, task="fixed pattern")
-            return vars(fixed_pattern(fine.images, fine.systematic, basis, amplitude, known, rho))
-
+        amplitude = np.einsum("ft,fjk->tjk", found.time_functions, found.coefficients)
         key = (self._setup.options, basis, found.time_functions, found.coefficients)
-        kept = self._setup.store.arrays("pattern", key, pattern)
-        self.prepared[1] = fine.without(kept["grey"])
-        self._flats_left = kept["left"]
+
+        def residual() -> Image:
+            return residuals(fine.images, basis, amplitude, progress=self._progress, task="fixed pattern")
+
+        def keep(made: Callable[[], Pattern]) -> Pattern:
+            return Pattern(**self._setup.store.arrays("pattern", key, lambda: vars(made())))
+
+        cleared = without_pattern(self._setup, fine, basis, amplitude, residual, keep)
+        self.prepared[1], self._flats_left = cleared.prepared, cleared.left
 
     def equations_at(self, basis: SectionBasis, amplitude: Floats) -> Equations:
         """Return the equations of scale 1 at amplitudes: the last pass, unless that was in an earlier run."""
@@ -288,11 +286,7 @@ class _Protocol:
 
     def noise(self, equations: Equations) -> Noise:
         """Return the noise of all images at scale 1; where the detector's is not stated, what the residual tells."""
-        fine = self.prepared[1]
-        noise = noise_of(self._setup, fine.systematic) or known_from_residual(
-            equations.rms, fine.systematic.shape, fine.systematic.detector, self._setup.options.smooth_px
-        )
-        return noise if self._flats_left is None else replace(noise, flat=noise.flat * self._flats_left)
+        return Cleared(prepared=self.prepared[1], left=self._flats_left).noise(self._setup, lambda: equations.rms)
 
     def _solved(
         self, name: str, basis: SectionBasis, stage: ResolvedStage, functions: Floats, start: Floats, to_noise: bool

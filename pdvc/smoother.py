@@ -24,6 +24,7 @@ would.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -300,6 +301,21 @@ def known_of(fit: Fitted, noise: Propagated, slow: Floats, matrix: Floats) -> Kn
 
 def of_image_model(fit: Fitted, slow: Floats, blocks: tuple[BlockVectors, ...], shape: tuple[int, int]) -> Floats:
     """Return the covariance (step, unknown, unknown) of slow errors beyond noise: `pdvc.coherent`."""
+    covariance, moved = slow_effects(fit, slow, blocks)
+    squares = np.concatenate([(each**2).sum(axis=0) for each in moved], axis=1)
+    more = excess(squares, np.einsum("tnn->n", covariance), shape)
+    larger = np.sqrt(np.tile(more, shape[0]))
+    return np.asarray(covariance * (np.outer(larger, larger) - 1))
+
+
+def slow_effects(
+    fit: Fitted, slow: Floats, blocks: tuple[BlockVectors, ...], draws: int = DRAWS
+) -> tuple[Floats, Iterator[Floats]]:
+    """Return what noise makes of slow errors, and what each block does.
+
+    The covariance (step, unknown, unknown), from `draws` draws, and the amplitudes that blocks make, some blocks at a
+    time (step, unknown, block).
+    """
     process, design = fit.process, fit.process.seen.design
     turned = design.transpose(0, 2, 1)
     metric = joined(turned @ design, slow)
@@ -311,15 +327,11 @@ def of_image_model(fit: Fitted, slow: Floats, blocks: tuple[BlockVectors, ...], 
         found = linalg.cho_solve(factor, z.reshape(len(metric), -1)).reshape(z.shape)
         return process.response(fit.smoothed, fit.deviations, design @ np.einsum("ft,fnd->tnd", slow, found))
 
-    draws = np.random.default_rng(0).standard_normal((*design.shape[:2], DRAWS))
-    noise = effect(np.einsum("ft,tnd->fnd", slow, turned @ draws))
-    covariance = noise @ noise.transpose(0, 2, 1) / DRAWS
+    drawn = np.random.default_rng(0).standard_normal((*design.shape[:2], draws))
+    noise = effect(np.einsum("ft,tnd->fnd", slow, turned @ drawn))
     z = by_block(blocks, turned @ fit.white, slow)
-    some = (z[..., start : start + DRAWS] for start in range(0, z.shape[2], DRAWS))
-    squares = np.concatenate([(effect(each) ** 2).sum(axis=0) for each in some], axis=1)
-    more = excess(squares, np.einsum("tnn->n", covariance), shape)
-    larger = np.sqrt(np.tile(more, shape[0]))
-    return np.asarray(covariance * (np.outer(larger, larger) - 1))
+    moved = (effect(z[..., start : start + DRAWS]) for start in range(0, z.shape[2], DRAWS))
+    return noise @ noise.transpose(0, 2, 1) / draws, moved
 
 
 def _root(covariance: Floats) -> Floats:

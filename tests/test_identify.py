@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pdvc.experiment import Series
 from pdvc.history import Angle, time_basis
 from pdvc.identify.beam import elongation_mm
 from pdvc.identify.carried import Carrier, shift_of
+from pdvc.identify.choice import Choices, choices
 from pdvc.identify.crosshead import from_crosshead
 from pdvc.identify.expected import assumed, slower_near_yield, unloading
 from pdvc.identify.integrated import Radiographs, expected_covariance, free_motion, integrated, log_evidence
@@ -73,11 +75,11 @@ def _cylinder(voxel_mm, radius_mm, dent=False):
 
 @pytest.mark.parametrize("dent", [False, True])
 def test_the_area_of_a_cylinder_is_found_with_and_without_a_dent(dent):
-    height, radius = outline_of(_cylinder(0.04, 0.6, dent), -1.3, 1.3)
-    area, perimeter = areas_of(radius)
+    outline = outline_of(_cylinder(0.04, 0.6, dent), -1.3, 1.3)
+    area, perimeter = areas_of(outline.radius_mm)
     np.testing.assert_allclose(area, np.pi * 0.36, rtol=5e-3)
     np.testing.assert_allclose(perimeter, 2 * np.pi * 0.6, rtol=5e-3)
-    assert height[0] == pytest.approx(-1.3, abs=0.05)
+    assert outline.height_mm[0] == pytest.approx(-1.3, abs=0.05)
     assert matrix_level(_cylinder(0.04, 0.6).values) == pytest.approx(0.3, rel=0.02)
 
 
@@ -313,3 +315,56 @@ def test_unloading_shows_young_and_less_noise_shows_more():
     assert cycled[0] < planned[0]
     quiet = replace(model, force_noise_N=0.1)
     assert (np.sqrt(np.diag(expected_covariance(quiet, FORCE_N, radiographs, known)))[:4] < planned[:4]).all()
+
+
+def test_the_share_that_e_is_wrong_by_is_found_and_does_not_move_the_law():
+    """c(t) + b w(t) of a known b: found within its deviation; without it as an unknown, the law would take it."""
+    model = _model()
+    vector = _truth(model)
+    radiographs, force = _radiographs(model, vector, np.random.default_rng(6))
+    rng = np.random.default_rng(7)
+    unknowns = radiographs.amplitude.shape[1]
+    # an e that pulls at the sections as a stretch would that grows with the load, and at all else a little
+    pull = 0.1 * model.linear(vector, FORCE_N).slopes[..., 1] + 0.002 * rng.normal(size=(STEPS, unknowns))
+    w = np.einsum("tnm,tm->tn", radiographs.equations.matrix, pull)
+    wrong = replace(radiographs.equations, vector=radiographs.equations.vector - 1.5 * w)
+    told = replace(radiographs, noise=replace(radiographs.noise, systematic=w), equations=wrong)
+    untold = replace(told, noise=radiographs.noise)
+    plain = integrated(model, force, vector, radiographs, rounds=1)
+    found, misled = (integrated(model, force, vector, each, plain.deviations) for each in (told, untold))
+    assert found.share[0] == pytest.approx(-1.5, abs=4 * found.share[1])
+    assert found.share[1] < 0.5
+    away = [abs(each.estimate.vector - plain.estimate.vector)[:4].max() for each in (found, misled)]
+    assert away[0] < 0.3 * away[1]
+    # what is not known of e is in the covariance, and told as its part
+    assert 0 < found.by_source["systematic"][1, 1] < found.estimate.covariance[1, 1]
+    assert (np.diag(found.estimate.covariance)[1:4] > np.diag(plain.estimate.covariance)[1:4]).all()
+
+
+def test_made_up_tests_are_told_apart_where_laws_differ_much_and_the_one_asked_for_is_doubted():
+    model = _model()
+    vector = _truth(model)
+    radiographs, force = _radiographs(model, vector, np.random.default_rng(8))
+    found = integrated(model, force, vector, radiographs, rounds=1)
+    observed = np.ones(len(BASIS.height_mm), dtype=bool)
+    opened = SimpleNamespace(
+        model=model,
+        force_N=force,
+        amplitude=radiographs.amplitude,
+        loaded=LOADED,
+        seen=seen_motions(BASIS, observed),
+        sections=len(observed),
+    )
+    result = choices(opened, radiographs, found, ("voce", "ludwik"), 1)
+    assert result.kinds == ("ludwik", "voce")
+    np.testing.assert_array_equal(result.chosen(), [[1, 0], [0, 1]])
+    assert result.error_rate() == 0
+    np.testing.assert_array_equal(result.doubted(), [0, 1])
+
+
+def test_wrong_choices_are_counted():
+    evidence = np.array([[[0.0, -1.0], [-5.0, 0.0]], [[0.0, -1.0], [-9.0, 0.0]]])
+    result = Choices(kinds=("ludwik", "swift"), log_evidence=evidence)
+    np.testing.assert_array_equal(result.chosen(), [[1, 1], [1, 1]])
+    assert result.error_rate() == 0.5
+    np.testing.assert_array_equal(result.doubted(), [0.5, 0.5])

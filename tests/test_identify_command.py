@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pdvc.experiment import read_experiment
-from pdvc.identify.protocol import IdentifyOptions, identify
+from pdvc.identify.options import IdentifyOptions
+from pdvc.identify.protocol import choice, identify
 from pdvc.identify.result import IdentificationError, read_identification
 from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.protocol import measure
@@ -122,3 +123,21 @@ def test_options_written_as_toml_are_read_again_and_a_law_to_compare_that_is_non
     opened, motion = read_experiment(measured / "experiment"), read_measurement(measured / "motion.nc")
     with pytest.raises(ValueError, match=r"law: expected one of .*, got 'hooke'"):
         identify(opened, motion, IdentifyOptions(compare=("hooke",)))
+
+
+def test_made_up_tests_tell_how_often_the_choice_would_be_right(measured, tmp_path):
+    command = ["identify-choice", measured / "experiment", "--measurement", measured / "motion.nc"]
+    command += ["-o", tmp_path / "choice.csv", "--draws", "1", "--law", "ludwik", "--law", "linear"]
+    told = pdvc_bench(*(str(each) for each in command))
+    assert told.exit_code == 0, told.output
+    assert "of 2" in told.output
+    lines = (tmp_path / "choice.csv").read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "true_law,draw,ludwik,linear"
+    assert [line.split(",")[0] for line in lines[1:]] == ["ludwik", "linear"]
+    assert np.isfinite(np.array([line.split(",")[2:] for line in lines[1:]], dtype=float)).all()
+
+
+def test_a_choice_of_a_single_law_is_refused(measured):
+    opened, motion = read_experiment(measured / "experiment"), read_measurement(measured / "motion.nc")
+    with pytest.raises(ValueError, match=r"compare: expected some laws to choose among, found none"):
+        choice(opened, motion, IdentifyOptions(), 1)

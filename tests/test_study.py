@@ -259,7 +259,7 @@ def test_an_unknown_study_is_answered_with_those_there_are(tmp_path):
 
 
 RUNS = {"noise": 80, "views-per-turn": 60, "sections": 60, "coverage": 60, "capture": 45, "resolution": 90}
-RUNS |= {"honest": 20, "which-error-matters": 64, "which-error-matters-most": 48}
+RUNS |= {"honest": 20, "identification": 16, "which-error-matters": 64, "which-error-matters-most": 48}
 
 
 @pytest.mark.parametrize(("name", "runs"), RUNS.items())

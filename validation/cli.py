@@ -40,7 +40,7 @@ for _command in (
     *(one.scenarios, one.options, one.simulate, one.inspect, one.measure, one.score, one.report, one.run),
     *(replaying.replay, replaying.movie),
     *(many.compare, many.studies, many.study, many.plan),
-    *(identifying.identify, identifying.identify_draws),
+    *(identifying.identify, identifying.identify_draws, identifying.identify_choice),
     *(live.prepare, live.live, live.play),
     *(watching.page, watching.watch),
     doors.export,

@@ -20,7 +20,8 @@ from pdvc.geometry import nearest_angles
 from pdvc.identify.carried import Carrier
 from pdvc.identify.integrated import Radiographs, expected_covariance, radiographs_at
 from pdvc.identify.model import Model, neck_ramps
-from pdvc.identify.protocol import IdentifyOptions, problem_at, profile_from
+from pdvc.identify.opening import problem_at, profile_from
+from pdvc.identify.options import IdentifyOptions
 from pdvc.onset import onset
 from pdvc.options import MeasureOptions
 from pdvc.preparation import prepare
@@ -68,10 +69,10 @@ def expected_laws(
     fine = prepare(setup, 1, progress)
     basis, steps = setup.sections, len(views)
     still = np.zeros((steps, *basis.shape))
-    problem = problem_at(setup, fine, basis, still, without_pattern=False, progress=progress)
+    problem = problem_at(setup, fine, basis, still, clear=False, progress=progress)
     spaces = Smoother().spaces(problem)
     radiographs = radiographs_at(problem, spaces, still.reshape(steps, -1))
-    profile, share = profile_from(fine.images.volume, basis, options)
+    profile, share = profile_from(fine.images.volume, setup, options)
     voxel_mm = experiment.geometry.voxel_mm
     model = Model(
         law=options.law,

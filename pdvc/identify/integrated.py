@@ -10,12 +10,14 @@ One pass over the radiographs at amplitudes a_0 gives B(t), c(t) and the covaria
 - x(t): the process of `pdvc.state_space`: the sample's rigid motion, bending, torsion, and whatever of stretch and
   contraction the law does not tell. Its deviations are of the largest marginal likelihood, as those of a measurement:
   where the law is right, they leave next to nothing beside it, and where it is wrong they say so;
-- the model's errors of each radiograph are apparent motions, as ever.
+- the model's errors of each radiograph are apparent motions, as ever;
+- what re-projection leaves, e, is subtracted, and known to a share, which is one unknown b ~ N(0, 1) of all steps: it
+  adds b w(t) to c(t) (`pdvc.noise.Propagated.systematic`), as if the sample moved by b B^-1 w.
 
-J are further columns of the process's trend, so that theta is found with all else at once, and its covariance holds
-what else there may be. Noise that steps have in common, what re-projection leaves, and errors of the image model over
-many steps add to it by the same sums as to a measured motion (`pdvc.smoother.known_of`). The marginal likelihood of
-the whole is the law's evidence (Laplace's, in theta).
+J and B^-1 w are further columns of the process's trend, so that theta is found with all else at once, and its
+covariance holds what else there may be. Noise that steps have in common, and errors of the image model over many
+steps, add to it by the same sums as to a measured motion (`pdvc.smoother.known_of`). The marginal likelihood of the
+whole is the law's evidence (Laplace's, in theta).
 """
 
 from __future__ import annotations
@@ -26,21 +28,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.banded import Blocks
+from pdvc.coherent import excess
 from pdvc.equations import Equations, joined
 from pdvc.identify.carried import shift_of
 from pdvc.identify.model import Model
 from pdvc.identify.two_step import Estimate
 from pdvc.noise import Propagated
 from pdvc.process import ROUNDS, Process, Seen, Smoothed
-from pdvc.smoother import COHERENT_DEGREE, Fitted, known_of, of_image_model, seen, slow_functions
+from pdvc.projection import BlockVectors
+from pdvc.smoother import COHERENT_DEGREE, Fitted, known_of, seen, slow_effects, slow_functions
 from pdvc.solution import Problem
 from pdvc.state_space import Deviations, StateSpace
 from pdvc.threads import one_thread
 
 Floats = NDArray[np.float64]
 
-FORCE = "force"
-"""Source of noise: that of the recorded force."""
+FORCE, SYSTEMATIC = "force", "systematic"
+"""Sources of what is uncertain: noise of the recorded force, and the share of e."""
+UNSEEN = 1e-10
+"""Of B's mean, is added to B: an unknown that no radiograph sees does not move."""
 MOST_STEPS = 12
 """Steps of theta, at most, for the equations of one pass."""
 SETTLED = 0.03
@@ -48,6 +54,8 @@ SETTLED = 0.03
 FAR = 3.0
 """Standard deviations beyond which a change is shortened unless the posterior grows."""
 HALVINGS = 6
+SLOW_DRAWS = 256
+"""Draws of noise that tell what it makes of slow errors."""
 LONGEST_STEP = 0.7
 """Change of an unknown in one step, at most: of a logarithm, or in prior deviations."""
 
@@ -85,6 +93,8 @@ class Identified:
     """Up to a constant that all laws have in common."""
     by_source: dict[str, Floats]
     """What each source adds to the covariance of the unknowns (unknown, unknown)."""
+    share: tuple[float, float]
+    """b, by how much e is wrong, and its standard deviation: both over the deviation that was believed before."""
 
 
 class _OfUnknowns(Process):
@@ -130,7 +140,7 @@ def integrated(
     known = deviations or radiographs.spaces[0].first_guess()
     try:
         with one_thread():
-            settled = _settled(model, force_N, start, radiographs, radiographs.spaces[1], known, asked)
+            settled = _settled(model, force_N, start, radiographs, known, asked)
             return _summed(model, settled, radiographs)
     except np.linalg.LinAlgError as error:
         raise ValueError(
@@ -166,17 +176,31 @@ def free_motion(radiographs: Radiographs, deviations: Deviations | None = None) 
 def log_evidence(
     model: Model, force_N: Floats, start: Floats, radiographs: Radiographs, deviations: Deviations
 ) -> float:
-    """Return the logarithm of a law's evidence, up to a constant, for deviations of the process found before.
+    """Return the logarithm of a law's evidence, up to a constant, for deviations of the process found before."""
+    return likeliest(model, force_N, start, radiographs, deviations)[1]
 
-    With few modes of whatever moves beside the law: the constant is another one than with all.
+
+def likeliest(
+    model: Model, force_N: Floats, start: Floats, radiographs: Radiographs, deviations: Deviations
+) -> tuple[Floats, float]:
+    """Return the unknowns (unknown,) of the largest posterior for given deviations, and the log of the law's evidence.
+
+    Where no motion is likely under the law, those to start from, and minus infinity.
     """
     with one_thread():
         try:
-            few = radiographs.spaces[0]
-            return _log_evidence(_settled(model, force_N, start, radiographs, few, deviations, 0), few)
+            settled = _settled(model, force_N, start, radiographs, deviations, 0)
         except np.linalg.LinAlgError:
-            # no motion is likely under the law
-            return -np.inf
+            return start, -np.inf
+        return settled.vector, _log_evidence(settled, radiographs.spaces[1])
+
+
+def refitted(
+    model: Model, force_N: Floats, start: Floats, radiographs: Radiographs, deviations: Deviations
+) -> Deviations:
+    """Return the deviations of the process beside a law, sought once more."""
+    with one_thread():
+        return _settled(model, force_N, start, radiographs, deviations, 1).deviations
 
 
 def _settled(
@@ -184,32 +208,36 @@ def _settled(
     force_N: Floats,
     start: Floats,
     radiographs: Radiographs,
-    space: StateSpace,
     known: Deviations,
     rounds: int,
 ) -> _Settled:
-    """Go from a start to the unknowns of the largest posterior; deviations are sought in some rounds."""
-    vector, lying = start, force_N
+    """Go from a start to the unknowns of the largest posterior; deviations are sought in some rounds.
+
+    They are sought with few modes, which cannot follow the law's columns: about the unknowns so far, then, and not
+    about the prior's mean.
+    """
+    few, space = radiographs.spaces
+    vector, lying, share = start, force_N, 0.0
     for _ in range(MOST_STEPS):
         about = _About.at(model, vector, lying, force_N, radiographs)
         if rounds:
-            few = Process(radiographs.spaces[0].with_trend(about.columns), about.seen)
+            near = Process(few.with_trend(about.columns), about.near(vector - model.unknowns.mean, share))
             # half of the rounds at first, and one each time that the unknowns have moved
             now = max(rounds // 2, 1)
-            known, rounds = few.fitted(known, now), rounds - now
-        process = Process(space.with_trend(about.columns), about.seen)
+            known, rounds = near.fitted(known, now), rounds - now
+        process = Process(space.with_trend(about.every_column), about.seen)
         smoothed = process.smoothed(known)
         scaled = _OfUnknowns(process, about.scale)
         found = model.unknowns.mean + smoothed.trend[-len(start) :] * about.scale
         deviation = scaled.deviation(smoothed)
         limit = np.minimum(LONGEST_STEP, LONGEST_STEP * model.unknowns.deviation)
-        share = min(1.0, float(np.min(limit / np.maximum(np.abs(found - vector), 1e-300))))
+        step = min(1.0, float(np.min(limit / np.maximum(np.abs(found - vector), 1e-300))))
         change = found - vector
         if np.abs(change / deviation).max() > FAR:
-            share = _shortened(model, vector, change, share, lying, force_N, radiographs, space, known)
-        vector = vector + share * change
-        lying = about.force(process, smoothed, known)
-        if share == 1.0 and np.abs(change / deviation).max() < SETTLED and not rounds:
+            step = _shortened(model, vector, change, step, lying, force_N, radiographs, known)
+        vector = vector + step * change
+        lying, share = about.force(process, smoothed, known), float(smoothed.trend[-len(start) - 1])
+        if step == 1.0 and np.abs(change / deviation).max() < SETTLED and not rounds:
             break
     return _Settled(
         vector=vector, force_N=lying, about=about, process=scaled, motion=process, smoothed=smoothed, deviations=known
@@ -224,7 +252,6 @@ def _shortened(
     lying: Floats,
     force_N: Floats,
     radiographs: Radiographs,
-    space: StateSpace,
     known: Deviations,
 ) -> float:
     """Return the share of a change, halved as often as it takes, at which the posterior is no smaller than before."""
@@ -233,6 +260,7 @@ def _shortened(
         about = _About.at(model, trial, lying, force_N, radiographs)
         moved = about.columns @ ((trial - model.unknowns.mean) / about.scale)
         left = about.seen.data - np.einsum("tnm,tm->tn", about.seen.design, moved)
+        space = radiographs.spaces[1].with_trend(about.believed)
         likely = Process(space, replace(about.seen, data=left)).smoothed(known).log_likelihood
         away = (trial - model.unknowns.mean) / model.unknowns.deviation
         return float(likely + np.linalg.slogdet(about.white)[1].sum() - away @ away / 2)
@@ -266,6 +294,8 @@ class _About:
     """What the law makes of the prior's mean, linear from here (step, unknown), voxels."""
     columns: Floats
     """J, each column times its prior deviation over that of the process's trend (step, unknown, column)."""
+    believed: Floats
+    """B^-1 w over the deviation of the trend (step, unknown, 1)."""
     scale: Floats
     """What makes unknowns of the trend's numbers (column,)."""
     by_force: Floats
@@ -291,6 +321,7 @@ class _About:
         return cls(
             offset=offset,
             columns=slopes * scale,
+            believed=_as_motion(equations.matrix, radiographs.noise.systematic) / radiographs.spaces[1].prior_voxel,
             scale=scale,
             by_force=np.einsum("tnm,tm->tn", white, pulled) * model.force_noise_N,
             force_N=force_N,
@@ -299,25 +330,54 @@ class _About:
             own=own,
         )
 
+    @property
+    def every_column(self) -> Floats:
+        """Return all columns, that of e first."""
+        return np.concatenate([self.believed, self.columns], axis=2)
+
+    def near(self, away: Floats, share: float) -> Seen:
+        """Return the data less what unknowns (unknown,), away from the mean of their prior, and a share of e make."""
+        moved = self.columns @ (away / self.scale) + share * self.believed[..., 0]
+        return replace(self.seen, data=self.seen.data - np.einsum("tnm,tm->tn", self.seen.design, moved))
+
     def force(self, process: Process, smoothed: Smoothed, deviations: Deviations) -> Floats:
         """Return the forces (step,) that are likeliest under all data, N."""
         left = self.seen.data - np.einsum("tnm,tm->tn", self.seen.design, process.amplitude(smoothed))
         return np.asarray(self.force_N + np.einsum("tn,tn->t", self.by_force, left) / deviations.misfit)
 
 
+def _as_motion(matrix: Floats, vector: Floats) -> Floats:
+    """Return B^-1 w (step, unknown, 1) of B (step, unknown, unknown) and w (step, unknown)."""
+    unknown = np.arange(matrix.shape[1])
+    whole = matrix.copy()
+    whole[:, unknown, unknown] += UNSEEN * np.einsum("tnn->t", matrix)[:, None] / len(unknown)
+    return np.asarray(np.linalg.solve(whole, vector[..., None]))
+
+
 def _summed(model: Model, settled: _Settled, radiographs: Radiographs) -> Identified:
     """Return what was found, with the covariance from all sources."""
     about, smoothed, blocks = settled.about, settled.smoothed, radiographs.equations.blocks
-    steps, count = len(settled.force_N), len(settled.vector)
+    steps, count_of_law = len(settled.force_N), model.unknowns.of_law
     fit = Fitted(process=settled.process, deviations=settled.deviations, smoothed=smoothed, white=about.white)
     of_force = joined(about.own[FORCE], radiographs.slow)
-    noise = replace(radiographs.noise, own=about.own, parts={**radiographs.noise.parts, FORCE: of_force})
+    noise = replace(
+        radiographs.noise,
+        own=about.own,
+        parts={**radiographs.noise.parts, FORCE: of_force},
+        # an unknown of the process
+        systematic=np.zeros_like(radiographs.noise.systematic),
+    )
     known = known_of(fit, noise, radiographs.slow, radiographs.equations.matrix)
     parts = {name: part[0] * steps for name, part in known.by_source.items()}
     covariance = known.covariance[0] * steps
+    e = len(smoothed.trend) - len(about.scale) - 1
+    with_e = smoothed.trend_covariance[-len(about.scale) :, e] * about.scale
+    parts[SYSTEMATIC] = np.outer(with_e, with_e) / smoothed.trend_covariance[e, e]
+    parts["process"] = parts["process"] - parts[SYSTEMATIC]
+    share = np.array([smoothed.trend[e], np.sqrt(smoothed.trend_covariance[e, e])]) / radiographs.spaces[1].prior_voxel
     if blocks and steps > COHERENT_DEGREE + 2:
         finer = slow_functions(radiographs.problem, COHERENT_DEGREE)
-        parts["image model"] = of_image_model(fit, finer, blocks, (1, count))[0]
+        parts["image model"] = _of_image_model(fit, finer, blocks, count_of_law)
         covariance = covariance + parts["image model"]
     moved = settled.motion.amplitude(smoothed)
     left = about.seen.data - np.einsum("tnm,tm->tn", about.seen.design, moved)
@@ -329,7 +389,21 @@ def _summed(model: Model, settled: _Settled, radiographs: Radiographs) -> Identi
         force_N=settled.force_N,
         log_evidence=_log_evidence(settled, radiographs.spaces[1]),
         by_source=parts,
+        share=(float(share[0]), float(share[1])),
     )
+
+
+def _of_image_model(fit: Fitted, slow: Floats, blocks: tuple[BlockVectors, ...], of_law: int) -> Floats:
+    """Return the covariance of the unknowns (unknown, unknown) from slow errors of the image model beyond noise.
+
+    By how much blocks of the residual make more of it than noise does is one number for all unknowns, of the law's
+    parameters together in the metric of their noise: of each by itself, some ten blocks would tell it.
+    """
+    covariance, moved = slow_effects(fit, slow, blocks, SLOW_DRAWS)
+    white = np.linalg.inv(np.linalg.cholesky(covariance[0, :of_law, :of_law]))
+    squares = np.concatenate([(white @ each[0, :of_law]) ** 2 for each in moved], axis=1)
+    more = excess(squares, np.ones(of_law), (of_law, 1))
+    return np.asarray(covariance[0] * (more - 1))
 
 
 def _log_evidence(settled: _Settled, space: StateSpace) -> float:

@@ -8,6 +8,8 @@ int r^2 / 2 over the directions.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -29,12 +31,28 @@ SURROUNDED = 0.8
 """Share of the directions in which a slice's middle is surrounded by matrix, at least."""
 HELD = 1.25
 """Deviations, times the usual size, that a radius is held within."""
+INNER = 0.8
+"""Share of the radius within which the mean grey level is that of the sample's inside."""
 _ROUNDS = 6
 _LEVELS = 200
 
 
-def outline_of(volume: Volume, low_mm: float, high_mm: float) -> tuple[Floats, Floats]:
-    """Return heights (slice,), mm, and the outline's radii (slice, direction), mm, between two heights.
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """Where a sample ends in its volume."""
+
+    height_mm: Floats
+    """(slice,), mm."""
+    radius_mm: Floats
+    """(slice, direction), mm."""
+    level: float
+    """Mean grey level of the inside, inclusions and all, per mm."""
+    sharpness: float
+    """By what share of the matrix's level grey levels fall within a voxel across a face, the median of all faces."""
+
+
+def outline_of(volume: Volume, low_mm: float, high_mm: float) -> Outline:
+    """Return the outline between two heights.
 
     Raises ValueError where no sample is found there, or it does not surround the middle of its slices.
     """
@@ -46,18 +64,51 @@ def outline_of(volume: Volume, low_mm: float, high_mm: float) -> tuple[Floats, F
         raise ValueError(f"volume: expected a sample between {low_mm:.4g} and {high_mm:.4g} mm, found none")
     level = matrix_level(values)
     middle: tuple[float, ...] = ndimage.center_of_mass((values > level / 2).any(axis=0))
-    angle = 2 * np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
-    along = np.arange(0, np.hypot(*values.shape[1:]) / 2, RADIAL_VOXEL)
-    places = [centre + np.outer(turned(angle), along) for centre, turned in zip(middle, (np.sin, np.cos), strict=True)]
-    radius = np.stack([_radii(ndimage.map_coordinates(each, places, order=1) / level) for each in values])
+    share = np.stack([around(each, middle) for each in values]) / level
+    radius = np.stack([radii(each) for each in share])
     whole = np.isfinite(radius).mean(axis=1) > SURROUNDED
     # rays through its cut ends may leave slices there without a sample
     first, last = int(whole.argmax()), len(whole) - int(whole[::-1].argmax())
     if not whole[first:last].all() or last - first < LEAST_SLICES:
         raise ValueError("volume: expected a sample around the middle of each slice, found air there")
     # an inclusion from the middle to the surface is a dent, too
-    found = np.nan_to_num(radius[first:last])
-    return np.asarray(z[chosen][first:last]), _followed(found, grid.voxel_mm) * grid.voxel_mm
+    followed = _followed(np.nan_to_num(radius[first:last]), grid.voxel_mm)
+    inside = [_inside(each, radius) for each, radius in zip(share[first:last], followed, strict=True)]
+    return Outline(
+        height_mm=np.asarray(z[chosen][first:last]),
+        radius_mm=followed * grid.voxel_mm,
+        level=level * float(np.mean(inside)),
+        sharpness=float(np.median([falls(*each) for each in zip(share[first:last], followed, strict=True)])),
+    )
+
+
+def directions_rad() -> Floats:
+    """Return the angles of the directions, from x to y (direction,), rad."""
+    return np.asarray(2 * np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS)
+
+
+def around(values: NDArray[np.float32], middle: tuple[float, ...]) -> Floats:
+    """Return the values of a slice (y, x) along all directions from a place (y, x) in voxels (direction, place)."""
+    along, angle = np.arange(0, np.hypot(*values.shape) / 2, RADIAL_VOXEL), directions_rad()
+    places = [centre + np.outer(turned(angle), along) for centre, turned in zip(middle, (np.sin, np.cos), strict=True)]
+    return np.asarray(ndimage.map_coordinates(values, places, order=1))
+
+
+def falls(share: Floats, radius: Floats) -> Floats:
+    """Return what shares of the level (direction, place) fall by in the voxel about radii (direction,), voxels."""
+    places = np.arange(len(radius))
+
+    def at(away: Floats) -> Floats:
+        return np.asarray(ndimage.map_coordinates(share, [places, away / RADIAL_VOXEL], order=1))
+
+    return at(radius - 0.5) - at(radius + 0.5)
+
+
+def _inside(share: Floats, radius: Floats) -> float:
+    """Return the mean of shares (direction, place) over the inside of radii (direction,), voxels, far from faces."""
+    along = RADIAL_VOXEL * np.arange(share.shape[1])
+    area = along * (along < INNER * radius[:, None])
+    return float((share * area).sum() / area.sum())
 
 
 def areas_of(radius_mm: Floats) -> tuple[Floats, Floats]:
@@ -81,7 +132,7 @@ def matrix_level(values: NDArray[np.float32]) -> float:
     return float(edge[place] + edge[place + 1]) / 2
 
 
-def _radii(share: Floats) -> Floats:
+def radii(share: Floats) -> Floats:
     """Return where shares of the matrix's level (direction, place) last fall through a half, voxels."""
     above = share > 0.5
     last = share.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)

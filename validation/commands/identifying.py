@@ -19,10 +19,16 @@ from validation.commands.parts import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import pandas as pd
     from rich.table import Table
 
-    from pdvc.identify.protocol import IdentifyOptions
+    from pdvc.identify.options import IdentifyOptions
+    from pdvc.progress import Progress
     from simulator.scenario import Scenario
+    from validation.batch.trial import Trial
+    from validation.study.description import Study
 
 Laws = Annotated[
     list[str] | None,
@@ -81,7 +87,7 @@ def identify(
     """
     with answering() as progress:
         from pdvc.experiment import read_experiment
-        from pdvc.identify.protocol import IdentifyOptions
+        from pdvc.identify.options import IdentifyOptions
         from pdvc.identify.protocol import identify as find
         from pdvc.identify.result import write_identification
         from pdvc.measurement_file import read_measurement
@@ -117,11 +123,13 @@ def identify(
 def identify_draws(
     scenario: ScenarioName,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Where everything goes.")],
-    draws: Annotated[int, typer.Option("--draws", min=1, metavar="N", help="Draws of the noise.")] = 50,
+    draws: Annotated[int, typer.Option("--draws", min=1, metavar="N", help="Draws of noise and texture.")] = 50,
     law: Laws = None,
     workers: Workers = None,
 ) -> None:
-    """Identify the law of many noise draws of a scenario by every method: bias, random error, coverage, time.
+    """Identify the law of many draws of a scenario by every method: bias, random error, coverage, time.
+
+    Each draw has other noise and other nodules, and the same shape, motion and law.
 
     Writes a row for each draw as soon as it is finished, and at the end DIR/table.csv and DIR/recovery.csv.
     Interrupted, it goes on where it was when the same command is given again.
@@ -129,7 +137,7 @@ def identify_draws(
     Example:  `pdvc-bench identify-draws quick --draws 50 -o out/draws`
     """
     with answering(resume="give the same command again to go on from here") as progress:
-        from pdvc.identify.protocol import IdentifyOptions
+        from pdvc.identify.options import IdentifyOptions
         from pdvc.lock import held
         from simulator.scenario import load_scenario
         from validation.batch.engine import run_trials
@@ -146,12 +154,83 @@ def identify_draws(
             write_text(out / "recovery.csv", found.to_csv(index=False))
     from rich.console import Console
 
-    rows = [[f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in row] for row in found.values.tolist()]
-    Console().print(_table(list(found.columns), rows))
+    Console().print(_table(list(found.columns), _cells(found)))
     failed = int((table["status"] != "done").sum())
     if failed:
         tell(f"{failed} of {len(table)} draws failed: see {out / 'failed'}")
     tell(f"table: {out / 'recovery.csv'}")
+
+
+def identify_choice(
+    experiment: ExperimentFolder,
+    measurement: Annotated[
+        Path, typer.Option("--measurement", metavar="FILE", help="A measurement of this experiment.")
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="CSV", help="The log evidence of each law in each made-up test.")
+    ],
+    draws: Annotated[int, typer.Option("--draws", min=1, metavar="N", help="Made-up tests of each law.")] = 10,
+    law: Laws = None,
+    options: Annotated[
+        Path | None,
+        typer.Option("--identify-options", metavar="TOML", help="All options of an identification; those above win."),
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Tell how often the choice among laws would be right in a test like this one.
+
+    Of each law, the one that explains the test best makes radiographs and forces with this test's noise; the largest
+    evidence then chooses among all, and the law asked for (the first) is doubted as in an identification.
+
+    Example:  `pdvc-bench identify-choice out/quick/experiment --measurement out/quick/measurement.nc -o choice.csv`
+    """
+    with answering() as progress:
+        from pdvc.experiment import read_experiment
+        from pdvc.identify.options import IdentifyOptions
+        from pdvc.identify.protocol import choice
+        from pdvc.measurement_file import read_measurement
+        from validation.identify.tables import choice_csv, choice_rows
+        from validation.job import write_text
+
+        asked = options_of(IdentifyOptions() if options is None else IdentifyOptions.read(options), law, None, None)
+        use_threads(threads)
+        found = choice(read_experiment(experiment), read_measurement(measurement), asked, draws, progress=progress)
+        write_text(out, choice_csv(found))
+    from rich.console import Console
+
+    Console().print(_table(["true law", *found.kinds, f"{found.kinds[0]} doubted"], choice_rows(found)))
+    tell(f"wrong choices: {found.error_rate():.0%} of {found.log_evidence[..., 0].size}")
+    tell(f"table: {out}")
+
+
+def study_of_laws(
+    study: Study,
+    trials: Sequence[Trial],
+    out: Path,
+    scheduler: str | None,
+    workers: int | None,
+    progress: Progress,
+) -> None:
+    """Carry out a study whose runs identify laws, and tell what was recovered and said of them."""
+    from pdvc.lock import held
+    from validation.batch.engine import run_trials
+    from validation.identify.study import identified_trials, recovery_of
+    from validation.job import write_text
+
+    runs = identified_trials(study, trials)
+    with held(out):
+        table = run_trials(runs, out, scheduler=scheduler, workers=workers, progress=progress)
+        recovered, said = recovery_of(study, trials, table)
+        for name, frame in (("table", table), ("recovery", recovered), ("laws", said)):
+            write_text(out / f"{name}.csv", frame.to_csv(index=False))
+    from rich.console import Console
+
+    for frame in (recovered, said):
+        Console().print(_table(list(frame.columns), _cells(frame)))
+    failed = int((table["status"] != "done").sum())
+    if failed:
+        tell(f"{failed} of {len(table)} runs failed: see {out / 'failed'}")
+    tell(f"tables: {out / 'recovery.csv'}, {out / 'laws.csv'}")
 
 
 def tell_planned_law(scenario: str, law: str, options: str, out: Path | None, threads: int | None) -> None:
@@ -160,7 +239,7 @@ def tell_planned_law(scenario: str, law: str, options: str, out: Path | None, th
         from pdvc.experiment import DESCRIPTION, read_experiment
         from pdvc.identify.expected import expected_laws
         from pdvc.identify.laws import law_named
-        from pdvc.identify.protocol import IdentifyOptions
+        from pdvc.identify.options import IdentifyOptions
         from validation.job import write_text
 
         asked, read, folder = IdentifyOptions(law=law_named(law)), read_options(options), Path(scenario)
@@ -208,6 +287,11 @@ def options_of(
     if until is not None:
         changes["until"] = until
     return options.model_copy(update=changes)
+
+
+def _cells(frame: pd.DataFrame) -> list[list[str]]:
+    """Return the cells of a table as text."""
+    return [[f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in row] for row in frame.values.tolist()]
 
 
 def _table(headings: list[str], rows: list[list[str]]) -> Table:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from validation.commands.identifying import tell_planned_law
+from validation.commands.identifying import study_of_laws, tell_planned_law
 from validation.commands.parts import (
     Options,
     Scheduler,
@@ -102,7 +102,8 @@ def study(
     """Simulate and measure many experiments that differ in chosen factors, and show how the error depends on these.
 
     Writes a row for each run as soon as it is finished, and at the end DIR/table.parquet, summary.csv, figures/ and
-    study.html. Interrupted or killed, it goes on where it was when the same command is given again.
+    study.html; of a study of laws table.csv, recovery.csv and laws.csv. Interrupted or killed, it goes on where it was
+    when the same command is given again.
 
     Example:  `pdvc-bench study noise -o out/noise`
     """
@@ -119,6 +120,9 @@ def study(
         trials = trials_of(chosen, path)
         if scheduler is not None and workers is not None:
             raise ValueError("--workers: expected without --scheduler, which has its own workers")
+        if chosen.laws:
+            study_of_laws(chosen, trials, out, scheduler, workers, progress)
+            return
         with held(out):
             table = run_trials(trials, out, scheduler=scheduler, workers=workers, progress=progress)
             page, summary = write_study_report(

@@ -1,10 +1,14 @@
-"""One draw of an identification study: other noise of all images and forces, the same sample, motion and law.
+"""One draw of an identification study: another texture, other noise of all images and forces, the same motion and law.
 
-The first draw is measured in full (`First`, a part that all draws share), and tells the deviations of the processes
-and the noise of all images. Each draw is then made ready by itself, counts, volume, areas, pattern and pass, at the
-motion that the first one found: the true motion is the same, and what draws differ by is far within what is linear.
-Its own motion, for the two-step methods, is one step of the smoother from there; the integrated identification seeks
-its process's deviations once more, from those of the first.
+What intervals hold beside noise, as what re-projection leaves of the texture, does not differ from one draw of noise
+to the next: a coverage of these alone would be that of one texture's luck. So each draw is another sample of nodules,
+of the same shape.
+
+The first one is measured in full (`First`, a part that all draws share), and tells the deviations of the processes to
+start from. Each draw is made ready by itself, counts, volume, areas, pattern, noise and pass, at the motion that the
+first one found: the true motion is the same, and what draws differ by is far within what is linear. Its own motion,
+for the two-step methods, is one step of the smoother from there; the integrated identification seeks its process's
+deviations once more, from those of the first.
 """
 
 from __future__ import annotations
@@ -23,12 +27,12 @@ from pdvc.digest import digest, software
 from pdvc.experiment import Experiment
 from pdvc.identify.crosshead import from_crosshead
 from pdvc.identify.integrated import free_motion, integrated, radiographs_at
-from pdvc.identify.protocol import IdentifyOptions, Ready, ready
+from pdvc.identify.opening import Ready, ready
+from pdvc.identify.options import IdentifyOptions
 from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, WEIGHTED
 from pdvc.identify.two_step import Estimate
 from pdvc.measurement import Measurement
 from pdvc.measurement_file import read_measurement, write_measurement
-from pdvc.noise import Propagated
 from pdvc.options import DEFAULT
 from pdvc.protocol import measure
 from pdvc.smoother import Smoother
@@ -76,28 +80,15 @@ class First:
         *_, free = free_motion(radiographs)
         start = opened.two_steps(opened.amplitude, _covariances(measurement, opened))[UNWEIGHTED].vector
         found = integrated(opened.model, opened.force_N, start, radiographs)
-        arrays: dict[str, NDArray[Any]] = {"vector": found.estimate.vector, "systematic": radiographs.noise.systematic}
-        for group, values in (
-            ("free", vars(free)),
-            ("law", vars(found.deviations)),
-            ("own", radiographs.noise.own),
-            ("part", radiographs.noise.parts),
-        ):
+        arrays: dict[str, NDArray[Any]] = {"vector": found.estimate.vector}
+        for group, values in (("free", vars(free)), ("law", vars(found.deviations))):
             arrays |= {f"{group}:{name}": value for name, value in values.items()}
         write_arrays(folder / "known.kept", arrays)
 
     def read(self, shared: Path) -> tuple[Measurement, dict[str, Any]]:
         """Return its measurement, and what else was found, by groups."""
         self.make(shared)
-        kept = read_arrays(shared / self.name / "known.kept")
-        assert kept is not None, "it was made"
-        groups: dict[str, Any] = {"free": {}, "law": {}, "own": {}, "part": {}}
-        for name, value in kept.items():
-            group, _, rest = name.partition(":")
-            if rest:
-                groups[group][rest] = value
-            else:
-                groups[name] = value
+        groups = _grouped(shared / self.name / "known.kept")
         return read_measurement(shared / self.name / "measurement.nc"), groups
 
 
@@ -106,37 +97,47 @@ class Draw:
     """One draw of a scenario whose law is identified; a `validation.batch.engine.Run`."""
 
     scenario: Scenario
-    options: IdentifyOptions
+    first: First
+
+    @property
+    def options(self) -> IdentifyOptions:
+        """Return what is identified."""
+        return self.first.options
 
     @cached_property
     def key(self) -> str:
         """Return a digest of all that the result depends on."""
         return digest(
             self.scenario.model_dump_json(exclude={"name", "title", "material"}),
-            self.options,
+            self.first.name,
             software("pdvc", "simulator", "validation"),
         )
 
     @property
     def columns(self) -> Mapping[str, Scalar]:
         """Return what says which run this is."""
-        return {"scenario": self.scenario.name, "law": self.options.law.kind, "repetition": self.scenario.repetition}
+        return {
+            "scenario": self.scenario.name,
+            "law": self.options.law.kind,
+            "texture": self.scenario.seed,
+            "repetition": self.scenario.repetition,
+        }
 
     @property
     def score_columns(self) -> Mapping[str, type]:
         """Return names and types of the scores."""
         names = tuple(self.options.law.values())
-        return {
-            f"{method}:{name}{what}": float for method in METHODS for name in names for what in ("", "_deviation")
-        } | {"area_error": float, **{f"seconds_{method}": float for method in (*METHODS, "ready")}}
+        found = (f"{method}:{name}{what}" for method in METHODS for name in names for what in ("", "_deviation"))
+        others = ("area_error", "share", "share_deviation", *(f"seconds_{part}" for part in (*METHODS, "ready")))
+        return dict.fromkeys((*found, *others), float)
 
     def parts(self) -> tuple[Part, ...]:
         """Return the clean stacks, and the first draw."""
-        return *clean_parts(self.scenario), First(self.scenario, self.options)
+        return *clean_parts(self.scenario), self.first
 
     def carry_out(self, shared: Path) -> Result:
         """Simulate, make ready and identify by every method; logarithms and their deviations are the scores."""
-        measurement, first = First(self.scenario, self.options).read(shared)
+        measurement, first = self.first.read(shared)
         with simulated(self.scenario, shared) as (experiment, _, _):
             return Result(scores=self._identified(experiment, measurement, first))
 
@@ -152,8 +153,7 @@ class Draw:
             took[part], clock = now - clock, now
 
         opened = ready(experiment, measurement, self.options)
-        noise = Propagated(parts=first["part"], own=first["own"], systematic=first["systematic"])
-        radiographs = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude, noise)
+        radiographs = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude)
         note("ready")
         amplitude, covariance, _ = free_motion(radiographs, Deviations(**first["free"]))
         found: dict[str, Estimate] = opened.two_steps(amplitude, covariance, first["vector"])
@@ -175,6 +175,7 @@ class Draw:
                 scores[f"{method}:{name}"] = float(estimate.vector[k])
                 scores[f"{method}:{name}_deviation"] = float(deviation[k])
         scores["area_error"] = self._area_error(opened)
+        scores["share"], scores["share_deviation"] = law.share
         return scores
 
     def _area_error(self, opened: Ready) -> float:
@@ -186,9 +187,25 @@ class Draw:
 
 
 def draws(scenario: Scenario, options: IdentifyOptions, count: int) -> list[Draw]:
-    """Return draws of a scenario, their noise numbered from 1; the crosshead's rate is told."""
+    """Return draws of a scenario, noise and textures numbered from its own; the crosshead's rate is told."""
     told = options.model_copy(update={"stroke_mm_per_s": scenario.loading.stroke_mm_per_s})
-    return [Draw(scenario=scenario.model_copy(update={"repetition": n}), options=told) for n in range(1, count + 1)]
+    first = First(scenario, told)
+    changes = ({"seed": scenario.seed + n, "repetition": n} for n in range(1, count + 1))
+    return [Draw(scenario=scenario.model_copy(update=each), first=first) for each in changes]
+
+
+def _grouped(path: Path) -> dict[str, Any]:
+    """Return kept arrays, those named ``group:name`` by groups."""
+    kept = read_arrays(path)
+    assert kept is not None, "it was made"
+    groups: dict[str, Any] = {}
+    for name, value in kept.items():
+        group, _, rest = name.partition(":")
+        if rest:
+            groups.setdefault(group, {})[rest] = value
+        else:
+            groups[name] = value
+    return groups
 
 
 def _covariances(measurement: Measurement, opened: Ready) -> Floats:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pdvc.experiment import Experiment
 from pdvc.identify.expected import ExpectedLaw, expected_laws
-from pdvc.identify.protocol import IdentifyOptions
+from pdvc.identify.options import IdentifyOptions
 from pdvc.options import MeasureOptions
 from pdvc.plan import PlannedTest
 from pdvc.progress import Progress, silent

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from pdvc.identify.choice import Choices
 from pdvc.identify.result import INTEGRATED, Identification
 
 _PERCENT = 100.0
@@ -52,6 +53,22 @@ def evidence_sentence(found: Identification) -> str:
     order = sorted(found.log_evidence, key=lambda kind: -found.log_evidence[kind])
     told = ", ".join(f"{kind} {_short(found.log_evidence[kind])}" for kind in order)
     return f"Log evidence over that of {found.law}: {told}."
+
+
+def choice_rows(found: Choices) -> list[list[str]]:
+    """Return a row for each true law: how often each was chosen, and how often the one asked for would be doubted."""
+    return [
+        [kind, *(str(number) for number in chosen), f"{doubted:.0%}"]
+        for kind, chosen, doubted in zip(found.kinds, found.chosen().tolist(), found.doubted(), strict=True)
+    ]
+
+
+def choice_csv(found: Choices) -> str:
+    """Return the log evidence of each law in each made-up test, as CSV: a line for each test."""
+    lines = [",".join(("true_law", "draw", *found.kinds))]
+    for kind, tests in zip(found.kinds, found.log_evidence, strict=True):
+        lines += [",".join((kind, str(n), *(f"{value:.3f}" for value in test))) for n, test in enumerate(tests)]
+    return "\n".join(lines) + "\n"
 
 
 def compliance_sentence(found: Identification) -> str:

@@ -137,6 +137,8 @@ class Study(Settings):
     """whether coverage is asked of all combinations together, each one draw of what may happen"""
     draw: tuple[str, ...] = ()
     """scores of a single run to draw against each factor, besides the errors: columns of the table"""
+    laws: tuple[str, ...] = ()
+    """laws to identify in each run, in place of scores of its motion: the true one, then wrong ones to ask for"""
     factor: tuple[Factor, ...] = ()
     """what varies; without any, the base is repeated"""
 
