@@ -168,7 +168,11 @@ def declared(*extras):
 
 @pytest.mark.parametrize(
     ("package", "extras"),
-    [("pdvc", ()), ("simulator", ("simulate", "spectra")), ("validation", ("simulate", "many", "live", "strategies"))],
+    [
+        ("pdvc", ()),
+        ("simulator", ("simulate", "spectra")),
+        ("validation", ("simulate", "many", "live", "sensitivity", "strategies")),
+    ],
 )
 def test_what_is_imported_is_declared(package, extras):
     owners = packages_distributions()

@@ -133,3 +133,14 @@ def test_the_figure_has_the_strongest_factor_on_top_and_its_table_the_papers_nam
     assert table["mu"].to_dict() == pytest.approx({"x0": 1, "x1": -3, "x2": 0})
     assert {"mu_star", "sigma"} <= set(table)
     assert "total" not in table
+
+
+def test_shares_of_few_samples_are_drawn_on_axes_that_hold_shares():
+    study = study_of("sobol", 4)
+    found = found_of(study, lambda x, y, z: x - 3 * y)
+    ax = influence_picture(study, found).figure.axes[1]
+    assert ax.get_xlim() == (-0.25, 1.5)
+    assert [bar.get_width() for bar in ax.patches] == [each.whole.value for each in (found[1], found[0], found[2])]
+    table = influence_table(study, found).set_index("factor")
+    assert table["total"].to_dict() == {each.factor: each.whole.value for each in found}
+    assert table["first"].to_dict() == {each.factor: each.alone.value for each in found}

@@ -17,6 +17,8 @@ from validation.study.summary import QUANTITIES
 
 TITLES = dict(zip(QUANTITIES, ("across the beam", "vertical", "along the beam", "axial strain"), strict=True))
 UNITS = dict(zip(QUANTITIES, ("voxel", "voxel", "voxel", "10⁻³"), strict=True))
+SHARES = (-0.25, 1.5)
+"""What the axes of shares hold: intervals of few samples go far beyond, where no share can be."""
 PART_NAMES = {"bias": "bias", "random": "random part", "error": "error, rms", COVERED: "covered by 95 %"}
 
 
@@ -37,6 +39,8 @@ def influence_picture(study: Study, found: Sequence[Influence]) -> StudyPicture:
                 continue
             some = {each.factor: each for each in found if (each.part, each.quantity) == (part, quantity)}
             draw_influences([some[name] for name in order], ax, scale=scale_of(study, part, quantity))
+            if study.design == "sobol":
+                ax.set_xlim(SHARES)
             said = "share of the variance: " if study.design == "sobol" else ""
             ax.set_xlabel(f"{said}{PART_NAMES[part]}{unit_of(study, part, quantity)}", fontsize=9)
     for quantity, ax in zip(QUANTITIES, axes[0], strict=True):
@@ -92,5 +96,6 @@ def _caption(study: Study) -> str:
     return (
         "Share of the variance in which each factor takes part, by itself and with others (bars: total index), and "
         "that which it has by itself (red marks: first-order index). Lines: 95 % interval of the total index, by "
-        f"SALib's bootstrap over {study.samples} samples. Shares below 0 or above 1 tell that the samples are few."
+        f"SALib's bootstrap over {study.samples} samples. Shares below 0 or above 1, and lines that leave the axes, "
+        "tell that the samples are few."
     )
