@@ -48,8 +48,9 @@ BLOCKS = 16
 """Blocks of pixels that tell the deviation of their mean, where the noise is not stated."""
 JOINED = 16
 """Steps that a measurement joins, about."""
-TOLD = 3.0
-"""A difference over what noise makes of it, rms over the steps, from which on it is one."""
+TOLD, MATTERS = 3.0, 2.0
+"""A difference over what noise makes of it, rms over the steps, from which on it is one; its worth over the stated
+deviation from which on it is doubted: the sample scatters into the air, and turns."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,7 +165,7 @@ def doubts_of_air(
     mean = ndimage.uniform_filter1d(off, width, mode="nearest")
     noise = float(np.sqrt(variance.mean() / width))
     size = float(np.sqrt(max(np.mean(mean**2) - noise**2, 0.0)))
-    if size <= TOLD * noise or size * worth_voxel <= stated_voxel:
+    if size <= TOLD * noise or size * worth_voxel <= MATTERS * stated_voxel:
         return
     whole, last = float(off.mean()), len(found.reference) // 4 or 1
     within = float(found.reference[-last:, 0].mean() - found.reference[:last, 0].mean())
@@ -174,5 +175,5 @@ def doubts_of_air(
         f"on average, {size:.3%} rms, known to {noise:.3%} (within the reference scan it changed by {within:+.3%}): "
         f"worth {size * worth_voxel:.2g} voxel along the beam, where a deviation of {stated_voxel:.2g} is stated",
         advice="measure with brightness = 'air', or take flats anew right before the test",
-        steps=tuple(np.flatnonzero(np.abs(mean) * worth_voxel > stated_voxel).tolist()),
+        steps=tuple(np.flatnonzero(np.abs(mean) * worth_voxel > MATTERS * stated_voxel).tolist()),
     )

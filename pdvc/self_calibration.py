@@ -20,12 +20,16 @@ to the right, and nearly all downwards (waves of two periods less, as opposite v
 share under `LEAST_SEEN` is left as told, and said. Motion that is not told from zero by `TOLD` deviations is left,
 too: errors that the volume makes otherwise, by interpolation and by its few views, would pass for it.
 
-Standard deviations come from blocks of pixels that err independently of each other, as in `pdvc.coherent`.
+Standard deviations come from blocks of pixels that err independently of each other, as in `pdvc.coherent`. What the
+views at theta and at theta + pi, mirrored about the axis, have in common of e is the material's: scatter, beam
+hardening, a detector that leans. It is large, and turns with the sample, so that blocks do not err independently; but
+a motion to the right is to the left in the mirror, and one downwards that opposite views agree on is taken up by the
+volume. So where what a parameter does is mostly of the other sort, its deviation is told by what of e is, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -48,7 +52,7 @@ from pdvc.correction import (
     view_motion,
 )
 from pdvc.experiment import Series
-from pdvc.geometry import ConeBeam
+from pdvc.geometry import ConeBeam, nearest_angles
 from pdvc.progress import Progress, silent
 from pdvc.projection import project_at_rest
 from pdvc.radiographs import Calibration, coarsened, grey_levels, sharpened
@@ -60,6 +64,7 @@ from pdvc.window import reached_rows, scan_grid
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+Unlike = Callable[[Image], Image]
 Sought = Literal["geometry", "motion"]
 """What is sought: the geometry alone, or the motion of the views besides."""
 
@@ -78,6 +83,8 @@ TOLD = 4.0
 """Deviations by which the motion of views differs from zero, or is none."""
 DEVIATION_PX = {"geometry": 5.0, "motion": 1.0}
 """Deviations before the data, px."""
+MOSTLY = 0.5
+"""Share of what a parameter does, squared, in which opposite views differ, from which on that alone tells of it."""
 BLOCKS = 8
 """Blocks of views, and of rows: errors of different ones are independent."""
 RENEWED_PX = 0.2
@@ -189,6 +196,19 @@ class _Scan:
         again = project_at_rest(volume, ray_vectors(geometry, angle).stacked(), views[0].shape)
         return np.asarray((again - views)[:, self._rows])
 
+    def _unlike(self, values: Mapping[str, float]) -> Unlike:
+        """Return what takes from images (view, row, column) what opposite views, mirrored, have in common."""
+        geometry = corrected(self._told, values).binned(self._scale)
+        opposite = nearest_angles(self._angle_rad + np.pi, self._angle_rad)
+        # the axis is in the middle of an image and of its mirror image once that is moved by
+        shift = -2 * geometry.column_shift_mm / geometry.pixel_mm
+
+        def unlike(images: Image) -> Image:
+            mirrored = ndimage.shift(images[opposite, :, ::-1], (0, 0, shift), order=1, mode="nearest")
+            return np.asarray((images - mirrored) / 2, dtype=np.float32)
+
+        return unlike
+
     def changes(self, values: Mapping[str, float], names: Sequence[str], e: Image, progress: Progress) -> Image:
         """Return J (parameter, view, row, column), grey levels per px, at values where `left` is e."""
         step = STEP_PX * self._scale
@@ -225,7 +245,7 @@ class _Scan:
             if changes is None or (rounds and last > RENEWED_PX):
                 changes = self.changes(values, names, e, progress)
             now = np.array([values[name] for name in names])
-            change, std = _change(changes, e, now, deviation)
+            change, std = _change(changes, e, self._unlike(values), now, deviation)
             values |= dict(zip(names, (now + change).tolist(), strict=True))
             e, rounds, last = self.left(values), rounds + 1, float(np.abs(change).max())
             if last < CONVERGED_PX or rounds == MOST_ROUNDS:
@@ -233,27 +253,37 @@ class _Scan:
         return _Settled(values=values, std=dict(zip(names, std.tolist(), strict=True)), change_px=last, rounds=rounds)
 
 
-def _change(changes: Image, e: Image, now: Floats, deviation: Floats) -> tuple[Floats, Floats]:
+def _change(changes: Image, e: Image, unlike: Unlike, now: Floats, deviation: Floats) -> tuple[Floats, Floats]:
     """Return the Gauss-Newton step (parameter,), px, from values `now`, and the standard deviations there.
 
     `changes` (parameter, view, row, column), `e` (view, row, column), `deviation` (parameter,) that of the prior, px.
     """
     flat = changes.reshape(len(changes), -1)
     matrix = (flat @ flat.T).astype(float)
-    blocks = [
-        changes[:, views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].reshape(len(changes), -1)
-        @ e[views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].ravel()
-        for views in np.array_split(np.arange(e.shape[0]), BLOCKS)
-        for rows in np.array_split(np.arange(e.shape[1]), BLOCKS)
-    ]
-    scores = np.stack(blocks).astype(float)
-    gradient, covariance = scores.sum(axis=0), scores.T @ scores
+    scores = _scores(changes, e)
+    gradient, own = scores.sum(axis=0), unlike(e)
+    for k, change in enumerate(changes):
+        if _rms(unlike(change)) ** 2 > MOSTLY * _rms(change) ** 2:
+            # a view and its opposite one tell the same: half as many are independent
+            scores[:, k] = np.sqrt(2) * _scores(change[None], own)[:, 0]
+    covariance = scores.T @ scores
     # e is no white noise: its variance is what the blocks make of it
     variance = float(np.median(np.diag(covariance) / np.diag(matrix)))
     ridge = np.diag(variance / deviation**2)
     inverse = np.linalg.inv(matrix + ridge)
     std = np.sqrt(np.diag(inverse @ (covariance + variance * ridge) @ inverse))
     return -inverse @ (gradient + ridge @ now), std
+
+
+def _scores(changes: Image, e: Image) -> Floats:
+    """Return the products (block, parameter) of changes (parameter, view, row, column) and e (view, row, column)."""
+    blocks = [
+        changes[:, views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].reshape(len(changes), -1)
+        @ e[views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].ravel()
+        for views in np.array_split(np.arange(e.shape[0]), BLOCKS)
+        for rows in np.array_split(np.arange(e.shape[1]), BLOCKS)
+    ]
+    return np.stack(blocks).astype(float)
 
 
 def _rms(image: Image) -> float:

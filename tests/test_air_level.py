@@ -103,11 +103,11 @@ def test_noise_alone_is_never_doubted(seed):
 @given(seed=st.integers(0, 10_000), off=st.floats(2e-4, 1e-2), sign=st.sampled_from((-1, 1)))
 def test_a_beam_that_drifts_is_doubted_where_it_is_worth_more_than_the_stated_deviation(seed, off, sign):
     found = levels(seed, test=sign * off)
-    (doubt,) = doubts(found, stated=0.5 * off * 1000)
+    (doubt,) = doubts(found, stated=0.25 * off * 1000)
     assert doubt.name == BEAM_DRIFT
     whole = float(doubt.figure.split("reference scan by ")[1].split("%")[0]) / 100
     assert whole == pytest.approx(sign * off, abs=5 * NOISE / np.sqrt(STEPS) * 1.5)
-    assert doubts(found, stated=2 * off * 1000 + 0.2) == []
+    assert doubts(found, stated=off * 1000 + 0.2) == []
 
 
 def test_a_drift_names_its_steps():

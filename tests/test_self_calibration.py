@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from pdvc.correction import (
     MOTION,
@@ -17,7 +18,7 @@ from pdvc.correction import (
     modes_of,
     view_motion,
 )
-from pdvc.radiographs import calibrate
+from pdvc.radiographs import calibrate, grey_levels
 from pdvc.rays import directions
 from pdvc.self_calibration import LEAST_SEEN, self_calibrated
 from pdvc.volume import Hull
@@ -99,6 +100,24 @@ def test_a_sample_that_drifts_during_the_scan_is_followed(right, down, sign):
     left -= np.linalg.lstsq(waves.T, left, rcond=None)[0] @ waves
     assert np.sqrt(np.mean(left**2)) < EXACT_PX
     assert correction.rms_after < 0.6 * correction.rms_before
+
+
+def test_what_the_material_does_alike_in_opposite_views_is_no_doubt_about_a_drift():
+    """Scatter, or beam hardening: the thicker the sample, the less is seen of it; and the sample drifts by 0.3 px."""
+    series, calibration, hull = prepared(2)
+    drift = modes_of(series.angle_rad, series.time_s)["drift"]
+    views = [
+        ndimage.shift(grey_levels(counts, calibration), (0.3 * t, 0.0), mode="nearest")
+        for counts, t in zip(series.counts, drift, strict=True)
+    ]
+    std = []
+    for bent in (0.0, 0.2):
+        counts = DARK + calibration.open_beam * np.exp(-np.stack([view - bent * view**2 for view in views]))
+        moved = replace(series, counts=np.rint(counts).astype(np.uint16))
+        parameter = by_name(self_calibrated(moved, BEAM, calibration, hull, "motion"))["down drift"]
+        assert parameter.value_px == pytest.approx(0.3, abs=0.04)
+        std.append(parameter.std_px)
+    assert std[1] < 1.6 * std[0]
 
 
 def test_a_sample_that_stands_elsewhere_is_no_fault_of_the_scanner():
