@@ -80,8 +80,9 @@ CONVERGED_PX = 0.005
 MOST_ROUNDS = 6
 LEAST_SEEN = 0.1
 """Share of what a parameter does that has to be seen for it to be sought."""
-TOLD = 4.0
-"""Deviations by which the motion of views differs from zero, or is none."""
+TOLD, LEAST_PX = 4.0, 0.02
+"""Deviations by which the motion of views differs from zero, or is none; and px that are seen of it at least, as the
+volume errs by about so much."""
 DEVIATION_PX = {"geometry": 5.0, "motion": 1.0}
 """Deviations before the data, px."""
 MOSTLY = 0.5
@@ -120,7 +121,7 @@ def self_calibrated(
     shares = coarse.shares(start.values, names, changes)
     seen = [name for name in names if shares[name] >= LEAST_SEEN]
     found = coarse.settled(start.values, seen, progress, changes[[names.index(name) for name in seen]])
-    told_apart = _told_apart(found, seen)
+    told_apart = _told_apart(found, seen, shares)
     std, rounds, values = found.std, start.rounds + found.rounds, found.values
     left = scans if len(told_apart) < len(seen) else scans[1:]
     while left:
@@ -130,7 +131,7 @@ def self_calibrated(
             values, rounds = found.values, rounds + found.rounds
         std = {**std, **found.std}
         # what is not told at the finer scale, either, is none
-        still = _told_apart(found, told_apart)
+        still = _told_apart(found, told_apart, shares)
         told_apart, left = still, [fine] if len(still) < len(told_apart) else []
 
     def parameter(name: str) -> Parameter:
@@ -165,7 +166,7 @@ class _Settled:
     covariance: Floats
 
 
-def _told_apart(found: _Settled, names: Sequence[str]) -> list[str]:
+def _told_apart(found: _Settled, names: Sequence[str], shares: Mapping[str, float]) -> list[str]:
     """Return the geometry, and the motions that are told from zero: the least told is left out, one after the other.
 
     A bend is much like a wave of one period, and a drift like another one, so that what is not there hides what is.
