@@ -177,11 +177,13 @@ def _told_apart(found: _Settled, names: Sequence[str], shares: Mapping[str, floa
         inverse = np.linalg.inv(found.matrix[np.ix_(left, left)])
         now = inverse @ found.matrix[left] @ values
         std = np.sqrt(np.diag(inverse @ found.covariance[np.ix_(left, left)] @ inverse))
-        over = {
-            k: abs(value) / size for k, value, size in zip(left, now, std, strict=True) if names[k] not in GEOMETRY
+        told = {
+            k: min(abs(value) / size / TOLD, abs(value) * shares[names[k]] / LEAST_PX)
+            for k, value, size in zip(left, now, std, strict=True)
+            if names[k] not in GEOMETRY
         }
-        least = min(over, key=over.__getitem__, default=None)
-        if least is None or over[least] > TOLD:
+        least = min(told, key=told.__getitem__, default=None)
+        if least is None or told[least] > 1:
             return [names[k] for k in left]
         left.remove(least)
 
