@@ -25,6 +25,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "row-shift": ("misalignment.row_shift_mm",),
     "lean": ("misalignment.lean_deg",),
     "stage": ("scanner.stage",),
+    "shake": ("scanner.stage.shake_mm",),
     "turning-0.1": ("acquisition.exposure_samples", "acquisition.exposure_share"),
     "spot-size": ("scanner.focal_spot.size_mm",),
     "spot-drift": ("scanner.focal_spot.drift_mm", "scanner.focal_spot.drift_time_s"),

@@ -1,7 +1,7 @@
 """Copies of an experiment folder with faults of the scanner: python -m benchmarks.spoilt FROM TO --beam 0.01.
 
-The counts of a folder, simulated or not, are changed as a beam that drifts, views that moved, or zingers and debris
-would have changed them; the rest, and the truth, are those of the folder it was made from.
+The counts of a folder, simulated or not, are changed as a beam that drifts, a scanner that moved, or zingers and
+debris would have changed them; the rest, and the truth, are those of the folder it was made from.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from pdvc.correction import MOTION, moved_back, view_motion
-from pdvc.experiment import REFERENCE, TEST, Experiment, read_experiment
+from pdvc.correction import MOTION, motion_after, moved_back, view_motion
+from pdvc.experiment import REFERENCE, TEST, Experiment, Series, read_experiment
 from pdvc.radiographs import calibrate, grey_levels
 
 Counts = NDArray[np.uint16]
@@ -34,12 +34,22 @@ def wandering_beam(experiment: Experiment, share: float) -> dict[str, Counts]:
 
 
 def moved_views(experiment: Experiment, motion_px: dict[str, float]) -> dict[str, Counts]:
-    """Return reference views that moved, by `motion_px` as in `pdvc.correction`."""
-    series, calibration = experiment.reference, calibrate(experiment)
-    way = view_motion(motion_px, series.angle_rad, series.time_s)
-    views = [moved_back(grey_levels(counts, calibration), -px) for counts, px in zip(series.counts, way, strict=True)]
-    counts = calibration.dark + calibration.open_beam * np.exp(-np.stack(views))
-    return {REFERENCE: np.rint(counts).clip(0, 65535).astype(np.uint16)}
+    """Return all radiographs of a scanner that moved during the scan, by `motion_px` as in `pdvc.correction`.
+
+    What drifted stays where the last view had it, and the stage does in the test what it did in the scan.
+    """
+    calibration, views, test = calibrate(experiment), experiment.reference, experiment.test
+
+    def moved(series: Series, way: NDArray[np.float64]) -> Counts:
+        grey = (grey_levels(counts, calibration) for counts in series.counts)
+        images = [moved_back(image, -px) for image, px in zip(grey, way, strict=True)]
+        counts = calibration.dark + calibration.open_beam * np.exp(-np.stack(images))
+        return np.rint(counts).clip(0, 65535).astype(np.uint16)
+
+    return {
+        REFERENCE: moved(views, view_motion(motion_px, views.angle_rad, views.time_s)),
+        TEST: moved(test, motion_after(motion_px, test.angle_rad)),
+    }
 
 
 def zingers(experiment: Experiment, count: int) -> dict[str, Counts]:
@@ -65,7 +75,9 @@ def main() -> None:
     parser.add_argument("to", type=Path, metavar="TO")
     parser.add_argument("--beam", type=float, metavar="SHARE", help="a beam that wanders by this share")
     parser.add_argument("--zingers", type=int, metavar="N", help="zingers in each radiograph, some dead lines, debris")
-    parser.add_argument("--views", nargs="+", metavar="NAME=PX", help=f"views that moved; names: {', '.join(MOTION)}")
+    parser.add_argument(
+        "--views", nargs="+", metavar="NAME=PX", help=f"how views, and the test, moved; names: {', '.join(MOTION)}"
+    )
     options = parser.parse_args()
     shutil.copytree(options.source, options.to)
     experiment = read_experiment(options.source)

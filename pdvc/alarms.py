@@ -3,6 +3,7 @@
 | alarm | what is tested | limit |
 | --- | --- | --- |
 | beam | transmission of the air beside the sample, less 1 | 0.03; from 0.05 on the radiograph is lost |
+| beam-drift | what the air of 16 radiographs, less that of the views, is worth along the beam | its deviation |
 | saturation | share of pixels at the largest count | 0.001 |
 | out-of-view | share of rows in which the sample covers a side of the detector, or a section that is off it | 0.02 |
 | stage | likeness to what is seen from where the stage was, less that from where it should be | 0.05, then lost |
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdvc.air_level import BEAM_DRIFT, JOINED, TOLD, air_of, worth_voxel
 from pdvc.cells import CRACK, LEAST_STEPS, Cells, Spot
 from pdvc.data_checks import AIR_DOUBT, AIR_ERROR, EDGE_SEEN, SATURATED, clips
 from pdvc.deviations import beam_frame
@@ -100,6 +102,14 @@ class Watch:
         some = np.linspace(0, len(setup.experiment.reference) - 1, 24).astype(int)
         reference = look_at(setup.experiment.reference.counts[some], setup.calibration)
         self._edge, self._flats_top = float(reference.edge.max()), share_at_top(setup.experiment.flats)
+        self._air = None
+        if setup.calibration.air is None:
+            self._air = air_of(setup.experiment, setup.calibration, (setup.experiment.reference,))
+        if self._air is not None:
+            self._views_air = self._air.levels(setup.experiment.reference.counts[some])
+        distance = setup.geometry.source_axis_mm / setup.geometry.voxel_mm
+        self._worth = worth_voxel(setup.experiment.reference.counts[0], setup.calibration, distance)
+        self._beams: list[tuple[float, float]] = []
         self.spot: Spot | None = None
         """Where the newest step shows most that is new; None after few steps."""
         self._newest, self._angle_rad = -1, math.nan
@@ -113,6 +123,8 @@ class Watch:
         found = list(self._of_counts(look_at(radiograph.counts[None], self._setup.calibration)))
         if radiograph.step > self._newest and not any(alarm.spoils for alarm in found):
             found += self._of_stage(radiograph)
+            if self._air is not None:
+                self._beams = [*self._beams[1 - JOINED :], self._air.level(radiograph.counts)]
         return tuple(found)
 
     def followed(self, line: StepLine, taken: Taken) -> tuple[Alarm, ...]:
@@ -122,7 +134,13 @@ class Watch:
         self._newest = line.step
         spot = self._cells.add(taken.residual, taken.amplitude, np.deg2rad(line.angle_deg))
         self.spot = spot if self._cells.steps > LEAST_STEPS else None
-        return (*self._of_place(taken), *self._of_motion(line, taken), *self._of_strain(line), *self._of_spot())
+        return (
+            *self._of_beam(line),
+            *self._of_place(taken),
+            *self._of_motion(line, taken),
+            *self._of_strain(line),
+            *self._of_spot(),
+        )
 
     def new(self, step: int, alarms: tuple[Alarm, ...]) -> tuple[Alarm, ...]:
         """Return those of a step's alarms that were not raised a few steps ago."""
@@ -142,6 +160,7 @@ class Watch:
             "before": self._before,
             "names": np.array(list(self._raised), dtype=str),
             "raised": np.array(list(self._raised.values()), dtype=np.int64),
+            "beams": np.array(self._beams),
             "jumps": np.array(self._jumps),
             "strains": np.array(self._strains),
         }
@@ -151,6 +170,7 @@ class Watch:
         self._cells.restore(kept)
         self._newest, self._angle_rad, self._before = int(kept["newest"]), float(kept["angle"]), kept["before"]
         self._raised = dict(zip(kept["names"].tolist(), kept["raised"].tolist(), strict=True))
+        self._beams = [(float(level), float(std)) for level, std in kept["beams"]]
         self._jumps = list(kept["jumps"])
         self._strains = list(kept["strains"])
 
@@ -192,6 +212,23 @@ class Watch:
                 value=covered,
                 limit=edge + EDGE_SEEN,
                 reason=f"the sample covers a side of the detector in {covered:.0%} of the rows",
+            )
+
+    def _of_beam(self, line: StepLine) -> Iterator[Alarm]:
+        """Compare what a beam that is not that of the reference scan is worth with the deviation that is stated."""
+        if len(self._beams) < JOINED:
+            return
+        sides = np.array(self._beams), self._views_air
+        beam, views = (float(each[:, 0].mean()) for each in sides)
+        off, noise = beam - views, float(np.sqrt(sum((each[:, 1] ** 2).mean() / len(each) for each in sides)))
+        stated = float(np.sqrt(np.mean(np.array(line.displacement_std)[:, 2] ** 2)))
+        if abs(off) > TOLD * noise and abs(off) * self._worth > stated:
+            yield Alarm(
+                name=BEAM_DRIFT,
+                value=abs(off) * self._worth,
+                limit=stated,
+                reason=f"by the air of {JOINED} radiographs the beam is off that of the reference scan by {off:+.3%}, "
+                f"which is worth {abs(off) * self._worth:.2g} voxel along the beam",
             )
 
     def _of_stage(self, radiograph: Arrival) -> Iterator[Alarm]:

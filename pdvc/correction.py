@@ -115,11 +115,43 @@ def corrected(told: ConeBeam, values_px: Mapping[str, float]) -> ConeBeam:
 
 def view_motion(values_px: Mapping[str, float], angle_rad: Floats, time_s: Floats) -> Floats:
     """Return how views at angles and times (view,) moved (view, 3), along `DIRECTIONS`, px, by values of `MOTION`."""
-    modes = modes_of(angle_rad, time_s)
-    result = np.zeros((len(time_s), len(DIRECTIONS)))
+    return _moved(values_px, modes_of(angle_rad, time_s), len(time_s))
+
+
+def _moved(values_px: Mapping[str, float], modes: Mapping[str, Floats], images: int) -> Floats:
+    result = np.zeros((images, len(DIRECTIONS)))
     for name in MOTION:
         direction, mode = name.split(" ", maxsplit=1)
         result[:, DIRECTIONS.index(direction)] += values_px.get(name, 0.0) * modes[mode]
+    return result
+
+
+def motion_after(values_px: Mapping[str, float], angle_rad: Floats) -> Floats:
+    """Return how images moved that were taken right after the views, at angles (image,): (image, 3), px.
+
+    What drifted stays where the last view had it; waves go with the angle of the stage, whenever it comes by.
+    """
+    modes = modes_of(angle_rad, angle_rad)
+    ended = modes_of(np.zeros(2), np.arange(2.0))
+    for name in ("drift", "bend"):
+        modes[name] = np.full(len(angle_rad), ended[name][-1])
+    return _moved(values_px, modes, len(angle_rad))
+
+
+def rays_of_moved(rays_mm: Floats, motion_px: Floats, scale: int, middle_px: Floats, half_rows: float) -> Floats:
+    """Return the rays (image, 4, 3), mm, that pixels of images show which moved by (image, 3), px as stored.
+
+    `rays_mm` (image, 4, 3) are source, corner, row and column of the pixels as they are told, as in `pdvc.rays`, in
+    pixels `scale` times as large; `middle_px` (2,) is the middle of the detector, and `half_rows` half its height, in
+    rows and columns of these counted from the corner.
+    """
+    result = rays_mm.copy()
+    for ray, (right, down, turn) in zip(result, motion_px, strict=True):
+        c, s = np.cos(turn / (half_rows * scale)), np.sin(turn / (half_rows * scale))
+        back = np.array([[c, -s], [s, c]])  # from where a pixel is (row, column) to where what it shows is due
+        ways = ray[2:].T  # mm for each row and column
+        ray[1] += ways @ (middle_px - back @ (middle_px + np.array([down, right]) / scale))
+        ray[2:] = (ways @ back).T
     return result
 
 

@@ -150,7 +150,7 @@ def look_at(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
         medians.append(float(np.median(believed)))
         found["air"].append(max(float(np.nanmedian(side)) for side in sides))
         found["edge"].append(max(float((side < SHADE * found["air"][-1]).mean()) for side in sides))
-        found["steepest"].append(_steepest(seen))
+        found["steepest"].append(_steepest(seen, good))
         inside = seen[good]
         at_top = int((believed == highs[-1]).sum())
         found["at_top"].append(at_top / believed.size if at_top >= CHANCE else 0.0)
@@ -164,11 +164,13 @@ def look_at(counts: NDArray[np.uint16], calibration: Calibration) -> StackLook:
     )
 
 
-def _steepest(transmission: Floats) -> float:
+def _steepest(transmission: Floats, good: NDArray[np.bool_]) -> float:
     """Return how steeply attenuation rises at the sample's edge: at once where a flat face lies along the beam."""
-    attenuation = -np.log(np.clip(transmission, 1e-3, None))
+    attenuation = np.where(good, -np.log(np.clip(transmission, 1e-3, None)), 0.0)
     largest = np.maximum(attenuation.max(axis=1), 1e-3)
-    return float(np.median(np.abs(np.diff(attenuation, axis=1)).max(axis=1) / largest))
+    # a dead column is no face
+    rise = np.abs(np.diff(attenuation, axis=1)) * (good[:, 1:] & good[:, :-1])
+    return float(np.median(rise.max(axis=1) / largest))
 
 
 def share_at_top(counts: NDArray[np.uint16]) -> float:

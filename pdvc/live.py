@@ -65,6 +65,7 @@ def make_ready(
     `experiment` as `read_experiment(folder, planned=True)` opens it. Interrupted, it goes on where it was. Raises
     ValueError where a test cannot be followed with these options.
     """
+    _check_followable(options)
     with held(work), one_thread():
         compile_kernels(progress=progress)
         Tracker(set_up(experiment, options, work=work, progress=progress), progress=progress)
@@ -90,6 +91,7 @@ def follow(
     Raises ExperimentError where the folder cannot be followed, ValueError where the test cannot be measured or the
     record belongs to another one or is complete, InUseError where another process is at the same file.
     """
+    _check_followable(options)
     folder, kept = work or file.with_name(file.name + ".work"), file.with_name(file.name + ".live")
     with held(folder), held(kept), closing(Record(record_of(file))) as record, one_thread():
         _check_unfinished(record)
@@ -114,6 +116,15 @@ def follow(
         if work is None:
             shutil.rmtree(folder, ignore_errors=True)
     return measurement
+
+
+def _check_followable(options: MeasureOptions) -> None:
+    """Raise ValueError for options that need all radiographs."""
+    if options.lag:
+        raise ValueError(
+            "lag: expected none where a test is followed, as the light of radiographs that are late or lost is not "
+            f"known, got {len(options.lag)}: give it to measure"
+        )
 
 
 def _check_unfinished(record: Record) -> None:

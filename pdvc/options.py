@@ -11,6 +11,7 @@ from pdvc.experiment import Experiment
 from pdvc.gauss_newton import GaussNewton
 from pdvc.geometry import ConeBeam
 from pdvc.history import PAPER, Ramp, TimeFunction, settled
+from pdvc.late_light import LatePart
 from pdvc.pgd import Pgd
 from pdvc.sections import CONTRACTION, RIGID, SectionPattern, motions_named, names_of, offered_motions
 from pdvc.settings import Settings, load_plugins
@@ -111,6 +112,8 @@ class MeasureOptions(Settings):
     """all pixels alike, as in the paper, or by the inverse of their noise"""
     brightness: Literal["flats", "air"] = "flats"
     """beam of each radiograph: that of the flats, or told by the air beside the sample, where any is seen"""
+    lag: tuple[LatePart, ...] = ()
+    """light that the panel gives back late, as measured on it, to be taken out: shares, each with its time"""
     self_calibration: Literal["none", "geometry", "motion"] = "none"
     """correct the geometry by the reference scan itself: not, axis and roll, or these and motion of its views"""
     outliers_over: Annotated[float, Field(ge=4, le=1e6)] | Literal["none"] = "none"

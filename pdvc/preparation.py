@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pdvc.correction import moved_back
+from pdvc.correction import moved_back, rays_of_moved
 from pdvc.equations import Images
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
@@ -148,7 +148,7 @@ def with_radiographs(setup: Setup, rest: AtRest, test: Series, progress: Progres
     systematic = replace(rest.systematic, step_rad=test.angle_rad)
     return Prepared(
         images=Images(
-            rays=ray_vectors(rest.geometry.cropped(*part), test.angle_rad).stacked(),
+            rays=_rays_of_test(setup, rest, test.angle_rad),
             grey=grey,
             weight=weight,
             volume=rest.volume,
@@ -160,6 +160,17 @@ def with_radiographs(setup: Setup, rest: AtRest, test: Series, progress: Progres
         snr_noise_db=_noise_snr(grey, variance, good),
         noise_rms=None if variance is None else float(np.sqrt(variance[:, good].mean(dtype=float))),
     )
+
+
+def _rays_of_test(setup: Setup, rest: AtRest, angle_rad: Floats) -> Floats:
+    """Return the rays (step, 4, 3) of the window at stage angles (step,), mm, where the scanner was in the test."""
+    geometry, part = rest.geometry, rest.part
+    rays = ray_vectors(geometry.cropped(*part), angle_rad).stacked()
+    motion_px = setup.test_motion_px(angle_rad)
+    if motion_px is None:
+        return rays
+    middle = (np.array([geometry.rows, geometry.columns]) - 1) / 2 - np.array([part[0], part[2]])
+    return rays_of_moved(rays, motion_px, rest.scale, middle, geometry.rows / 2)
 
 
 def keep_volumes(

@@ -34,12 +34,13 @@ from pdvc.preparation import Prepared, prepare, snr_of, snr_reprojection
 from pdvc.progress import Progress, silent
 from pdvc.residual_tests import residual_tests
 from pdvc.result_checks import check_finite, doubts_of_result, doubts_of_spots
+from pdvc.scanner_checks import doubts_of_scanner
 from pdvc.sections import SectionBasis
 from pdvc.setup import Setup, set_up
 from pdvc.solution import Known, Problem, Solution
 from pdvc.threads import one_thread
 from pdvc.uncertainty import posterior, stated
-from pdvc.verdict import Stop, Verdict, explained_by
+from pdvc.verdict import Doubt, Stop, Verdict, explained_by
 from pdvc.volume import Volume
 from pdvc.without_pattern import Cleared, without_pattern
 
@@ -65,13 +66,13 @@ def measure(
     doubts = (*doubts_of_data(examined, experiment), *doubts_of_time(time_parts, experiment.test))
     examining = time.perf_counter() - examining
     with one_thread(), explained_by(doubts):
-        found, volume, spots = _measured(experiment, options, work, progress)
+        found, volume, spots, of_scanner = _measured(experiment, options, work, progress)
     geometry = experiment.geometry
     if found.correction is not None:
         geometry = corrected(geometry, found.correction.values_px)
     doubts = cleared(doubts, found.correction)
     after = doubts_of_result(found, volume, geometry, options.prior_voxel)
-    verdict = Verdict(doubts=(*doubts, *after, *doubts_of_spots(spots)))
+    verdict = Verdict(doubts=(*doubts, *of_scanner, *after, *doubts_of_spots(spots)))
     with explained_by(verdict.doubts):
         check_finite(found)
     seconds = {"compile": compiling, "examine": examining, **found.provenance.seconds}
@@ -80,8 +81,11 @@ def measure(
 
 def _measured(
     experiment: Experiment, options: MeasureOptions, work: Path | None, progress: Progress
-) -> tuple[Measurement, Volume, list[Spot]]:
-    """Return a measurement without a verdict, the reference volume at scale 1, and what is new at each step."""
+) -> tuple[Measurement, Volume, list[Spot], tuple[Doubt, ...]]:
+    """Return a measurement without a verdict, the reference volume at scale 1, what is new at each step, and doubts.
+
+    These are about the scanner, which may have changed between reference scan and test.
+    """
     started = time.perf_counter()
     setup = set_up(experiment, options, work=work, progress=progress)
     rigid, sections, time_functions = setup.rigid, setup.sections, setup.time_functions()
@@ -163,7 +167,7 @@ def _measured(
         ),
         correction=setup.correction,
     )
-    return measurement, fine.images.volume, spots
+    return measurement, fine.images.volume, spots, doubts_of_scanner(setup, prepared, measurement.motion)
 
 
 def _on_the_axis(

@@ -18,14 +18,19 @@ to 1/2 over the turn) and of a bend (t^2) there are left, by their Fourier serie
 
 to the right, and nearly all downwards (waves of two periods less, as opposite views agree on them). What is seen to a
 share under `LEAST_SEEN` is left as told, and said. Motion that is not told from zero by `TOLD` deviations is left,
-too: errors that the volume makes otherwise, by interpolation and by its few views, would pass for it.
+too, the least told first, as a bend is much like a wave, and a drift like another one: errors that the volume makes
+otherwise, by interpolation and by its few views, would pass for it.
 
-Standard deviations come from blocks of pixels that err independently of each other, as in `pdvc.coherent`.
+Standard deviations come from blocks of pixels that err independently of each other, as in `pdvc.coherent`. What the
+views at theta and at theta + pi, mirrored about the axis, have in common of e is the material's: scatter, beam
+hardening, a detector that leans. It is large, and turns with the sample, so that blocks do not err independently; but
+a motion to the right is to the left in the mirror, and one downwards that opposite views agree on is taken up by the
+volume. So where what a parameter does is mostly of the other sort, only that part of J and e tells it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -48,7 +53,7 @@ from pdvc.correction import (
     view_motion,
 )
 from pdvc.experiment import Series
-from pdvc.geometry import ConeBeam
+from pdvc.geometry import ConeBeam, nearest_angles
 from pdvc.progress import Progress, silent
 from pdvc.projection import project_at_rest
 from pdvc.radiographs import Calibration, coarsened, grey_levels, sharpened
@@ -60,6 +65,7 @@ from pdvc.window import reached_rows, scan_grid
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
+Unlike = Callable[[Image], Image]
 Sought = Literal["geometry", "motion"]
 """What is sought: the geometry alone, or the motion of the views besides."""
 
@@ -74,10 +80,13 @@ CONVERGED_PX = 0.005
 MOST_ROUNDS = 6
 LEAST_SEEN = 0.1
 """Share of what a parameter does that has to be seen for it to be sought."""
-TOLD = 4.0
-"""Deviations by which the motion of views differs from zero, or is none."""
+TOLD, LEAST_PX = 4.0, 0.02
+"""Deviations by which the motion of views differs from zero, or is none; and px that are seen of it at least, as the
+volume errs by about so much."""
 DEVIATION_PX = {"geometry": 5.0, "motion": 1.0}
 """Deviations before the data, px."""
+MOSTLY = 0.5
+"""Share of what a parameter does, squared, in which opposite views differ, from which on that alone tells of it."""
 BLOCKS = 8
 """Blocks of views, and of rows: errors of different ones are independent."""
 RENEWED_PX = 0.2
@@ -112,13 +121,18 @@ def self_calibrated(
     shares = coarse.shares(start.values, names, changes)
     seen = [name for name in names if shares[name] >= LEAST_SEEN]
     found = coarse.settled(start.values, seen, progress, changes[[names.index(name) for name in seen]])
-    told_apart = [name for name in seen if name in GEOMETRY or abs(found.values[name]) > TOLD * found.std[name]]
-    std, rounds = found.std, start.rounds + found.rounds
-    values = {name: value if name in told_apart else 0.0 for name, value in found.values.items()}
-    for scan in scans if len(told_apart) < len(seen) else scans[1:]:
-        found = scan.settled(values, told_apart, progress)
-        values, rounds = found.values, rounds + found.rounds
-    std = {**std, **found.std}
+    told_apart = _told_apart(found, seen, shares)
+    std, rounds, values = found.std, start.rounds + found.rounds, found.values
+    left = scans if len(told_apart) < len(seen) else scans[1:]
+    while left:
+        values = {name: value if name in told_apart else 0.0 for name, value in values.items()}
+        for scan in left:
+            found = scan.settled(values, told_apart, progress)
+            values, rounds = found.values, rounds + found.rounds
+        std = {**std, **found.std}
+        # what is not told at the finer scale, either, is none
+        still = _told_apart(found, told_apart, shares)
+        told_apart, left = still, [fine] if len(still) < len(told_apart) else []
 
     def parameter(name: str) -> Parameter:
         state: State = "not observable" if name not in seen else "found" if name in told_apart else "none"
@@ -147,6 +161,31 @@ class _Settled:
     """Of those that were sought."""
     change_px: float
     rounds: int
+    matrix: Floats
+    """Normal matrix of those that were sought, with the prior, and the covariance of its right-hand side."""
+    covariance: Floats
+
+
+def _told_apart(found: _Settled, names: Sequence[str], shares: Mapping[str, float]) -> list[str]:
+    """Return the geometry, and the motions that are told from zero: the least told is left out, one after the other.
+
+    A bend is much like a wave of one period, and a drift like another one, so that what is not there hides what is.
+    """
+    values, left = np.array([found.values[name] for name in names]), list(range(len(names)))
+    while True:
+        # least squares again, with those that were left out at zero
+        inverse = np.linalg.inv(found.matrix[np.ix_(left, left)])
+        now = inverse @ found.matrix[left] @ values
+        std = np.sqrt(np.diag(inverse @ found.covariance[np.ix_(left, left)] @ inverse))
+        told = {
+            k: min(abs(value) / size / TOLD, abs(value) * shares[names[k]] / LEAST_PX)
+            for k, value, size in zip(left, now, std, strict=True)
+            if names[k] not in GEOMETRY
+        }
+        least = min(told, key=told.__getitem__, default=None)
+        if least is None or told[least] > 1:
+            return [names[k] for k in left]
+        left.remove(least)
 
 
 class _Scan:
@@ -189,6 +228,19 @@ class _Scan:
         again = project_at_rest(volume, ray_vectors(geometry, angle).stacked(), views[0].shape)
         return np.asarray((again - views)[:, self._rows])
 
+    def _unlike(self, values: Mapping[str, float]) -> Unlike:
+        """Return what takes from images (view, row, column) what opposite views, mirrored, have in common."""
+        geometry = corrected(self._told, values).binned(self._scale)
+        opposite = nearest_angles(self._angle_rad + np.pi, self._angle_rad)
+        # the axis is in the middle of an image and of its mirror image once that is moved by
+        shift = -2 * geometry.column_shift_mm / geometry.pixel_mm
+
+        def unlike(images: Image) -> Image:
+            mirrored = ndimage.shift(images[opposite, :, ::-1], (0, 0, shift), order=1, mode="nearest")
+            return np.asarray((images - mirrored) / 2, dtype=np.float32)
+
+        return unlike
+
     def changes(self, values: Mapping[str, float], names: Sequence[str], e: Image, progress: Progress) -> Image:
         """Return J (parameter, view, row, column), grey levels per px, at values where `left` is e."""
         step = STEP_PX * self._scale
@@ -225,35 +277,57 @@ class _Scan:
             if changes is None or (rounds and last > RENEWED_PX):
                 changes = self.changes(values, names, e, progress)
             now = np.array([values[name] for name in names])
-            change, std = _change(changes, e, now, deviation)
+            change, matrix, covariance = _change(changes, e, self._unlike(values), now, deviation)
             values |= dict(zip(names, (now + change).tolist(), strict=True))
             e, rounds, last = self.left(values), rounds + 1, float(np.abs(change).max())
             if last < CONVERGED_PX or rounds == MOST_ROUNDS:
                 break
-        return _Settled(values=values, std=dict(zip(names, std.tolist(), strict=True)), change_px=last, rounds=rounds)
+        inverse = np.linalg.inv(matrix)
+        std = np.sqrt(np.diag(inverse @ covariance @ inverse))
+        return _Settled(
+            values=values,
+            std=dict(zip(names, std.tolist(), strict=True)),
+            change_px=last,
+            rounds=rounds,
+            matrix=matrix,
+            covariance=covariance,
+        )
 
 
-def _change(changes: Image, e: Image, now: Floats, deviation: Floats) -> tuple[Floats, Floats]:
-    """Return the Gauss-Newton step (parameter,), px, from values `now`, and the standard deviations there.
+def _change(changes: Image, e: Image, unlike: Unlike, now: Floats, deviation: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the Gauss-Newton step (parameter,), px, from values `now`, its matrix and its right side's covariance.
 
     `changes` (parameter, view, row, column), `e` (view, row, column), `deviation` (parameter,) that of the prior, px.
     """
-    flat = changes.reshape(len(changes), -1)
-    matrix = (flat @ flat.T).astype(float)
-    blocks = [
-        changes[:, views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].reshape(len(changes), -1)
-        @ e[views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].ravel()
-        for views in np.array_split(np.arange(e.shape[0]), BLOCKS)
-        for rows in np.array_split(np.arange(e.shape[1]), BLOCKS)
-    ]
-    scores = np.stack(blocks).astype(float)
-    gradient, covariance = scores.sum(axis=0), scores.T @ scores
+    told, scores, own = np.empty_like(changes), np.empty((BLOCKS**2, len(changes))), unlike(e)
+    less = np.ones(len(changes))
+    for k, change in enumerate(changes):
+        told[k] = unlike(change)
+        if _rms(told[k]) ** 2 > MOSTLY * _rms(change) ** 2:
+            # a view and its opposite one tell the same: half as many are independent
+            scores[:, k], less[k] = _scores(told[k], own), np.sqrt(2)
+        else:
+            told[k] = change
+            scores[:, k] = _scores(change, e)
+    flat = told.reshape(len(told), -1)
+    matrix, gradient = (flat @ flat.T).astype(float), scores.sum(axis=0)
+    covariance = (less * scores).T @ (less * scores)
     # e is no white noise: its variance is what the blocks make of it
     variance = float(np.median(np.diag(covariance) / np.diag(matrix)))
     ridge = np.diag(variance / deviation**2)
-    inverse = np.linalg.inv(matrix + ridge)
-    std = np.sqrt(np.diag(inverse @ (covariance + variance * ridge) @ inverse))
-    return -inverse @ (gradient + ridge @ now), std
+    matrix = matrix + ridge
+    return -np.linalg.solve(matrix, gradient + ridge @ now), matrix, covariance + variance * ridge
+
+
+def _scores(change: Image, e: Image) -> Floats:
+    """Return the products (block,) of a change and e, both (view, row, column)."""
+    product = change * e
+    blocks = (
+        product[views[0] : views[-1] + 1, rows[0] : rows[-1] + 1].sum(dtype=float)
+        for views in np.array_split(np.arange(e.shape[0]), BLOCKS)
+        for rows in np.array_split(np.arange(e.shape[1]), BLOCKS)
+    )
+    return np.fromiter(blocks, dtype=float)
 
 
 def _rms(image: Image) -> float:

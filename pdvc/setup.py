@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from pdvc.beam_hardening import Outline, find_outline
 from pdvc.brightness import air_pixels, brightness
-from pdvc.correction import Correction, corrected, correction_of, text_of, view_motion
+from pdvc.correction import Correction, corrected, correction_of, motion_after, text_of, view_motion
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import ConeBeam
 from pdvc.history import time_basis
+from pdvc.late_light import image_time_s, without_late_light
 from pdvc.measurement import Recording
 from pdvc.options import MeasureOptions, ResolvedOptions, check_discarded, resolved
 from pdvc.prior import Prior
@@ -77,6 +78,16 @@ class Setup:
         found = view_motion(self.correction.values_px, views.angle_rad, views.time_s)
         return found if found.any() else None
 
+    def test_motion_px(self, angle_rad: Floats) -> Floats | None:
+        """Return how radiographs of the test at stage angles (step,) moved (step, 3), px; None where none did.
+
+        The scanner is as the last view left it, and its stage does at an angle what it did there.
+        """
+        if self.correction is None:
+            return None
+        found = motion_after(self.correction.values_px, angle_rad)
+        return found if found.any() else None
+
     def recording(self) -> Recording:
         """Return what was recorded, for the result."""
         test = self.experiment.test
@@ -134,6 +145,7 @@ def set_up(
     """
     told = experiment.geometry
     check_discarded(options, told)
+    experiment = _without_lag(experiment, options)
     correction = _corrected(experiment, options, Store(work, experiment), progress)
     if correction is not None:
         experiment = replace(experiment, geometry=corrected(told, correction.values_px))
@@ -153,6 +165,26 @@ def set_up(
         rigid=rigid,
         sections=sections,
     )
+
+
+def _without_lag(experiment: Experiment, options: MeasureOptions) -> Experiment:
+    """Return an experiment without the light that came late, if the options tell of any."""
+    if not options.lag:
+        return experiment
+    calibration, light = calibrate(experiment), np.ones(experiment.flats.shape[1:], dtype=np.float32)
+    found: list[Series] = []
+    for name, series in (("reference", experiment.reference), ("test", experiment.test)):
+        counts, light = without_late_light(
+            series.counts,
+            calibration.dark,
+            calibration.open_beam,
+            options.lag,
+            image_time_s(series.time_s, name),
+            light,
+        )
+        found.append(replace(series, counts=counts))
+    reference, test = found
+    return replace(experiment, reference=reference, test=test)
 
 
 def _corrected(experiment: Experiment, options: MeasureOptions, store: Store, progress: Progress) -> Correction | None:

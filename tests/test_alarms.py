@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
+from pdvc.air_level import JOINED
 from pdvc.alarms import BEFORE, QUIET, SPAN, Alarm, Watch
 from pdvc.cells import CRACK, LEAST_STEPS, Cells
 from pdvc.experiment import Experiment, read_experiment
@@ -221,6 +222,18 @@ def test_a_jump_that_a_radiograph_shows_is_sudden_and_one_along_the_beam_is_not(
         assert names(watch.followed(*motion(setup, 20, jump=jump))) == due
         # one as old as that is not looked at
         assert watch.followed(*motion(setup, 20, jump=jump)) == ()
+
+
+@pytest.mark.parametrize(("share", "due"), [(0.99, [JOINED - 1]), (1.0, [])])
+def test_a_beam_that_drifted_a_little_is_told_once_enough_radiographs_show_it(experiment, setup, share, due):
+    watch, dark, told = Watch(setup), np.mean(experiment.darks, axis=0), []
+    for step in range(JOINED + 2):
+        counts = np.rint(dark + share * (experiment.test.counts[step] - dark))
+        assert watch.seen(arrival(experiment, step, counts)) == ()
+        line, taken = motion(setup, step)
+        line = replace(line, displacement_std=((0.1, 0.1, 0.5),) * len(line.displacement_std))
+        told += [step for alarm in watch.new(step, watch.followed(line, taken)) if alarm.name == "beam-drift"]
+    assert told == due
 
 
 def test_nothing_is_unusual_before_it_is_known_what_is_usual(setup):

@@ -16,12 +16,15 @@ from pdvc.correction import (
     corrected,
     correction_of,
     modes_of,
+    motion_after,
     moved_back,
+    rays_of_moved,
     text_of,
     view_motion,
 )
 from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.protocol import measure
+from pdvc.radiographs import calibrate, grey_levels
 from pdvc.rays import ray_vectors
 from tests.command_line import only_line, pdvc_bench
 from tests.spheres import BEAM, experiment
@@ -49,7 +52,12 @@ def test_a_corrected_geometry_sees_a_point_where_a_moved_image_has_it(axis, roll
 
 def place_of(point, geometry, angle):
     """Return row and column at which a point (3,), mm, is seen."""
-    source, corner, down, right = ray_vectors(geometry, angle).stacked()[0]
+    return place_by(point, ray_vectors(geometry, angle).stacked())
+
+
+def place_by(point, rays):
+    """Return the same by rays (1, 4, 3)."""
+    source, corner, down, right = rays[0]
     unknown = np.linalg.solve(np.stack([point - source, -down, -right], axis=1), corner - source)
     return unknown[1:]
 
@@ -68,6 +76,41 @@ def test_a_view_that_moved_is_moved_back(motion, scale):
     back = moved_back(moved.astype(np.float32), motion, scale)
     inner = np.s_[6:-6, 6:-6]
     assert back[inner] == pytest.approx(blob(column - (columns - 1) / 2, row - (rows - 1) / 2)[inner], abs=2e-3)
+
+
+@FEW
+@given(
+    motion=st.tuples(*[st.floats(-3, 3)] * 3),
+    scale=st.sampled_from((1, 2)),
+    corner=st.tuples(st.integers(0, 9), st.integers(0, 9)),
+    tilt=st.floats(-0.1, 0.1),
+)
+def test_rays_of_an_image_that_moved_see_a_point_where_the_motion_has_brought_it(motion, scale, corner, tilt):
+    angle, point = np.array([0.3]), np.array([0.2, -0.4, 1.1])
+    whole = replace(BEAM, roll_rad=tilt).binned(scale)
+    row, column = corner
+    window = whole.cropped(row, whole.rows, column, whole.columns)
+    middle = (np.array([whole.rows, whole.columns]) - 1) / 2
+    rays = ray_vectors(window, angle).stacked()
+    moved = rays_of_moved(rays, np.array([motion]), scale, middle - corner, whole.rows / 2)
+    right, down, turn = motion
+    turn /= whole.rows / 2 * scale
+    away = place_of(point, whole, angle) - middle
+    due = [np.cos(turn) * away[0] + np.sin(turn) * away[1], np.cos(turn) * away[1] - np.sin(turn) * away[0]]
+    due = middle + due + np.array([down, right]) / scale - corner
+    assert place_by(point, moved) == pytest.approx(due, abs=1e-9)
+    # without motion they are the same to the last bit but one
+    assert rays_of_moved(rays, np.zeros((1, 3)), scale, middle - corner, 1.0) == pytest.approx(rays, abs=1e-13)
+
+
+def test_after_the_views_what_drifted_stays_and_waves_go_with_the_angle():
+    values = {"right drift": 0.6, "right bend": 0.2, "down sin": 0.4, "turn cos 2": -0.3}
+    series = experiment(views=40, steps=2).reference
+    views = view_motion(values, series.angle_rad, series.time_s)
+    after = motion_after(values, series.angle_rad[[-1, 10, 17]] + 4 * np.pi)
+    assert after[0] == pytest.approx(views[-1])
+    assert after[:, 0] == pytest.approx([0.5] * 3)
+    assert after[1:, 1:] == pytest.approx(views[[10, 17], 1:])
 
 
 def blob(x, y):
@@ -121,6 +164,34 @@ def test_a_measurement_with_a_wrong_axis_is_that_with_the_right_one(tmp_path):
     # what is kept is found again
     again = measure(told, options, work=tmp_path)
     assert np.array_equal(again.motion.amplitude, wrong.motion.amplitude)
+
+
+def test_a_scanner_that_drifts_during_the_scan_is_followed_into_the_test():
+    """The image moves by its angle, and by its time in the scan, and stays there in the test."""
+    small = SmallExperiment(small_scenario())
+    here, values = small.experiment, {"right drift": 0.8, "down cos": 0.4}
+    calibration = calibrate(here)
+
+    def moved(series, way):
+        views = [
+            moved_back(grey_levels(counts, calibration), -px) for counts, px in zip(series.counts, way, strict=True)
+        ]
+        counts = calibration.dark + calibration.open_beam * np.exp(-np.stack(views))
+        return replace(series, counts=np.rint(counts).clip(0, 65535).astype(np.uint16))
+
+    views, test = here.reference, here.test
+    drifted = replace(
+        here,
+        reference=moved(views, view_motion(values, views.angle_rad, views.time_s)),
+        test=moved(test, motion_after(values, test.angle_rad)),
+    )
+    options = small.options.model_copy(update={"self_calibration": "motion"})
+    away = [
+        np.abs(measure(drifted, each).motion.amplitude - small.measurement.motion.amplitude)[..., :3].mean()
+        for each in (options, small.options)
+    ]
+    assert away[0] < 0.06
+    assert away[1] > 4 * away[0]
 
 
 def test_the_command_line_refuses_what_it_does_not_know(tmp_path):

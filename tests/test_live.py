@@ -11,10 +11,12 @@ import pytest
 import tifffile
 
 from pdvc import lagged, live
+from pdvc.correction import corrected
 from pdvc.deviations import beam_frame
 from pdvc.experiment import Experiment, ExperimentError, read_experiment
 from pdvc.gauss_newton import GaussNewton
 from pdvc.incoming import IncomingWriter
+from pdvc.late_light import LatePart
 from pdvc.live import follow, make_ready
 from pdvc.options import MeasureOptions, StageOptions
 from pdvc.protocol import measure
@@ -115,6 +117,33 @@ def test_stated_intervals_of_each_step_hold_for_the_true_motion(followed, scenar
     assert max(sizes) > 1
     # along the beam too little is known here: grey levels of so coarse a scenario are some percent off
     assert (np.mean(share, axis=(0, 1))[:2] > 0.85).all()
+
+
+def test_a_test_is_followed_with_the_scanner_that_its_reference_scan_tells(folder, planned, followed, tmp_path):
+    """Told with the axis beside its place, prepared, followed and measured as if it had been told rightly."""
+    options = MeasureOptions(self_calibration="geometry")
+    wrong = replace(planned, geometry=corrected(planned.geometry, {"column_shift": -1.3, "roll": 0.5}))
+    work, steps = tmp_path / "ready", 8
+    make_ready(wrong, options, work=work)
+    arriving = played(folder, tmp_path / "in", range(steps))
+    found = follow(wrong, arriving, tmp_path / "motion.nc", options, work=work, idle_s=0.0)
+    assert found.correction is not None
+    assert found.correction.values_px["column_shift"] == pytest.approx(1.3, abs=0.03)
+    assert found.correction.values_px["roll"] == pytest.approx(-0.5, abs=0.1)
+    told, right = (
+        np.array([line.displacement_voxel for line in motions(lines)][:steps])
+        for lines in (read_record(record_of(tmp_path / "motion.nc")), followed[0])
+    )
+    assert len(told) == found.recording.steps == steps
+    assert np.sqrt(((told - right) ** 2).mean(axis=(0, 1)))[:2] == pytest.approx([0, 0], abs=0.05)
+
+
+def test_light_that_comes_late_is_not_taken_out_while_a_test_is_followed(planned, tmp_path):
+    options = MeasureOptions(lag=(LatePart(share=0.01, time_s=1.0),))
+    with pytest.raises(ValueError, match="lag: expected none where a test is followed"):
+        make_ready(planned, options, work=tmp_path / "ready")
+    with pytest.raises(ValueError, match="lag: expected none where a test is followed"):
+        follow(planned, tmp_path, tmp_path / "motion.nc", options)
 
 
 class Killed(BaseException):

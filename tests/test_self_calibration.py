@@ -19,7 +19,7 @@ from pdvc.correction import (
 )
 from pdvc.radiographs import calibrate
 from pdvc.rays import directions
-from pdvc.self_calibration import LEAST_SEEN, self_calibrated
+from pdvc.self_calibration import LEAST_SEEN, _change, self_calibrated
 from pdvc.volume import Hull
 from tests.spheres import BEAM, DARK, attenuation, experiment, sample
 
@@ -99,6 +99,29 @@ def test_a_sample_that_drifts_during_the_scan_is_followed(right, down, sign):
     left -= np.linalg.lstsq(waves.T, left, rcond=None)[0] @ waves
     assert np.sqrt(np.mean(left**2)) < EXACT_PX
     assert correction.rms_after < 0.6 * correction.rms_before
+
+
+def test_what_the_material_does_alike_in_opposite_views_is_no_doubt_about_a_drift():
+    """As scatter or beam hardening do: large, with the angle, and alike in a view and in its mirrored opposite one."""
+    rng, views = np.random.default_rng(4), 32
+
+    def unlike(images):
+        return (images - np.roll(images, views // 2, axis=0)[:, :, ::-1]) / 2
+
+    t = np.linspace(-0.5, 0.5, views, endpoint=False)[:, None, None]
+    slope = np.abs(rng.standard_normal((1, 40, 12)))
+    drift = unlike(t * (slope + slope[:, :, ::-1])).astype(np.float32)
+    found, stated = [], []
+    for _ in range(40):
+        noise = 0.1 * rng.standard_normal(drift.shape)
+        alike = 3.0 * np.cos(2 * np.pi * t + rng.uniform(0, 2 * np.pi)) ** 2 * slope
+        e = noise + alike + np.roll(alike, views // 2, axis=0)[:, :, ::-1]
+        change, matrix, covariance = _change(drift[None], e.astype(np.float32), unlike, np.zeros(1), np.full(1, 1e3))
+        found.append(float(change[0]))
+        moved, *_ = _change(drift[None], (e - 0.3 * drift).astype(np.float32), unlike, np.zeros(1), np.full(1, 1e3))
+        assert moved[0] - change[0] == pytest.approx(0.3, abs=0.003)
+        stated.append(float(np.sqrt(covariance[0, 0]) / matrix[0, 0]))
+    assert np.std(found) == pytest.approx(np.mean(stated), rel=0.3)
 
 
 def test_a_sample_that_stands_elsewhere_is_no_fault_of_the_scanner():
