@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from pdvc.identify.beam import elongation_mm
 from pdvc.identify.model import Model
-from pdvc.identify.two_step import MOST_EVALUATIONS, Estimate
+from pdvc.identify.two_step import MOST_EVALUATIONS, LawEstimate
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ SLACK_MM = 0.02
 _STEP_N = 0.05
 
 
-def from_crosshead(model: Model, force_N: Floats, stroke_mm: Floats, loaded: int, start: Floats) -> Estimate:
+def from_crosshead(model: Model, force_N: Floats, stroke_mm: Floats, loaded: int, start: Floats) -> LawEstimate:
     """Return the unknowns, with log C and s_0 after them, from forces and strokes (step,), a start (unknown,).
 
     Only steps from `loaded` on count.
@@ -56,4 +56,4 @@ def from_crosshead(model: Model, force_N: Floats, stroke_mm: Floats, loaded: int
         found = solved.x
     covariance = np.linalg.inv(solved.jac.T @ solved.jac) * np.outer(deviation, deviation)
     away = solved.fun[: len(force_N) - loaded]
-    return Estimate(vector=mean + found * deviation, covariance=covariance, misfit=float(np.sqrt(np.mean(away**2))))
+    return LawEstimate(vector=mean + found * deviation, covariance=covariance, misfit=float(np.sqrt(np.mean(away**2))))

@@ -32,7 +32,7 @@ from pdvc.coherent import excess
 from pdvc.equations import Equations, joined
 from pdvc.identify.carried import shift_of
 from pdvc.identify.model import Model
-from pdvc.identify.two_step import Estimate
+from pdvc.identify.two_step import LawEstimate
 from pdvc.noise import Propagated
 from pdvc.process import ROUNDS, Process, Seen, Smoothed
 from pdvc.projection import BlockVectors
@@ -80,7 +80,7 @@ class Radiographs:
 class Identified:
     """What radiographs and force say of a law."""
 
-    estimate: Estimate
+    estimate: LawEstimate
     deviations: Deviations
     """Of the process beside the law."""
     amplitude: Floats
@@ -382,7 +382,7 @@ def _summed(model: Model, settled: _Settled, radiographs: Radiographs) -> Identi
     moved = settled.motion.amplitude(smoothed)
     left = about.seen.data - np.einsum("tnm,tm->tn", about.seen.design, moved)
     return Identified(
-        estimate=Estimate(vector=settled.vector, covariance=covariance, misfit=float(np.sqrt(np.mean(left**2)))),
+        estimate=LawEstimate(vector=settled.vector, covariance=covariance, misfit=float(np.sqrt(np.mean(left**2)))),
         deviations=settled.deviations,
         amplitude=about.offset + moved,
         of_law=model.amplitude(settled.vector, settled.force_N),

@@ -19,7 +19,7 @@ from pdvc.identify.model import Model, neck_ramps
 from pdvc.identify.options import IdentifyOptions
 from pdvc.identify.outline import areas_of, outline_of, profile_of
 from pdvc.identify.result import UNWEIGHTED, WEIGHTED
-from pdvc.identify.two_step import Estimate, seen_motions, unweighted, weighted, zeroed
+from pdvc.identify.two_step import LawEstimate, seen_motions, unweighted, weighted, zeroed
 from pdvc.measurement import Measurement
 from pdvc.noise import Propagated, propagate
 from pdvc.onset import force_noise, onset
@@ -73,7 +73,7 @@ class Ready:
         time_s = self.experiment.test.time_s
         return np.asarray(self.options.stroke_mm_per_s * np.maximum(time_s - time_s[self.loaded], 0.0))
 
-    def two_steps(self, amplitude: Floats, covariance: Floats, start: Floats | None = None) -> dict[str, Estimate]:
+    def two_steps(self, amplitude: Floats, covariance: Floats, start: Floats | None = None) -> dict[str, LawEstimate]:
         """Return what a measured motion (step, unknown) and its covariances (step, unknown, unknown) tell."""
         flat = zeroed(amplitude, self.loaded)
         plain = unweighted(self.model, flat, self.seen, self.force_N, self.sections, start)

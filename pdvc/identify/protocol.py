@@ -19,7 +19,7 @@ from pdvc.identify.model import Model
 from pdvc.identify.opening import Ready, largest_MPa, ready
 from pdvc.identify.options import IdentifyOptions
 from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, Found, Identification
-from pdvc.identify.two_step import Estimate, unweighted, zeroed
+from pdvc.identify.two_step import LawEstimate, unweighted, zeroed
 from pdvc.measurement import Measurement
 from pdvc.progress import Progress, silent
 from pdvc.protocol import versions
@@ -130,7 +130,7 @@ class _Clock:
         self.seconds[part], self._last = now - self._last, now
         return self.seconds[part]
 
-    def found(self, part: str, estimate: Estimate) -> Found:
+    def found(self, part: str, estimate: LawEstimate) -> Found:
         """Return an estimate with the time it took."""
         return Found(
             vector=estimate.vector,
@@ -214,7 +214,7 @@ def _strains(measurement: Measurement, found: Identified, steps: int) -> dict[st
     }
 
 
-def _curve(model: Model, estimate: Estimate, force_N: Floats) -> Floats:
+def _curve(model: Model, estimate: LawEstimate, force_N: Floats) -> Floats:
     """Return plastic strains up to the largest one, the flow stress there, and the limits of its 95 % band, MPa."""
     _, plastic = model.strains(estimate.vector, force_N)
     # denser where it has just yielded, and the first one not quite zero, where slopes may be infinite

@@ -30,7 +30,7 @@ MOST_EVALUATIONS = 30
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimate:
+class LawEstimate:
     """What a method made of the unknowns."""
 
     vector: Floats
@@ -58,7 +58,7 @@ def unweighted(
     force_N: Floats,
     sections: int,
     start: Floats | None = None,
-) -> Estimate:
+) -> LawEstimate:
     """Return the nearest law by least squares of all displacements, amplitudes (step, unknown), voxels.
 
     `seen` are the unknowns that count, those of the axial motion, one for each of `sections`, first.
@@ -72,7 +72,7 @@ def unweighted(
         found = _nearest(model, amplitude[:, seen], seen, force_N, white, start)
         start = found.vector
         spread *= found.misfit
-    return Estimate(vector=found.vector, covariance=found.covariance, misfit=spread)
+    return LawEstimate(vector=found.vector, covariance=found.covariance, misfit=spread)
 
 
 def weighted(
@@ -83,7 +83,7 @@ def weighted(
     force_N: Floats,
     sections: int,
     start: Floats,
-) -> Estimate:
+) -> LawEstimate:
     """Return the nearest law in the metric of covariances (step, unknown, unknown), voxel^2, from a start."""
     found = start
     for _ in range(_REWEIGHED):
@@ -118,7 +118,7 @@ def _nearest(
     force_N: Floats,
     white: Floats,
     start: Floats | None = None,
-) -> Estimate:
+) -> LawEstimate:
     """Return the law nearest to data (step, seen) once they are white, under the prior of the unknowns."""
     unknowns = model.unknowns
 
@@ -137,7 +137,7 @@ def _nearest(
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(unknowns.deviation, unknowns.deviation)
     away = found.fun[: data.size]
     freedom = max(data.size - len(force_N) - len(first), 1)
-    return Estimate(
+    return LawEstimate(
         vector=unknowns.mean + found.x * unknowns.deviation,
         covariance=covariance,
         misfit=float(np.sqrt((away**2).sum() / freedom)),

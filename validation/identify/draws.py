@@ -30,7 +30,7 @@ from pdvc.identify.integrated import free_motion, integrated, radiographs_at
 from pdvc.identify.opening import Ready, ready
 from pdvc.identify.options import IdentifyOptions
 from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, WEIGHTED
-from pdvc.identify.two_step import Estimate
+from pdvc.identify.two_step import LawEstimate
 from pdvc.measurement import Measurement
 from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.options import DEFAULT
@@ -156,7 +156,7 @@ class Draw:
         radiographs = radiographs_at(opened.problem, Smoother().spaces(opened.problem), opened.amplitude)
         note("ready")
         amplitude, covariance, _ = free_motion(radiographs, Deviations(**first["free"]))
-        found: dict[str, Estimate] = opened.two_steps(amplitude, covariance, first["vector"])
+        found: dict[str, LawEstimate] = opened.two_steps(amplitude, covariance, first["vector"])
         note(UNWEIGHTED)
         took[WEIGHTED] = took[UNWEIGHTED]
         if opened.stroke_mm is not None:
