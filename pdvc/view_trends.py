@@ -1,11 +1,11 @@
 """What the reference views leave of their own re-projection tells of the scanner: where they moved, and how bright.
 
 The volume F is made of all views, so that a view that differs from the others differs from its re-projection, too:
-e_i = P_i F - f_i. Where that is small, and f' is f moved by d and brighter by s,
+e_i = P_i F - f_i. Where that is f moved by d and brighter by s,
 
-    e = d_right df/dx + d_down df/dy + d_roll (y df/dx - x df/dy) + s f,
+    e = d_right dm/dx + d_down dm/dy + d_roll (y dm/dx - x dm/dy) + s m,          m = (f + P F) / 2,
 
-fitted to the pixels of each view by least squares (f stands for P F in the slopes). Over the views, d and s are fitted
+but for third powers of d, fitted to the pixels of each view by least squares. Over the views, d and s are fitted
 by what scanners do (`pdvc.correction`): d by a constant, a drift from first to last view, and waves of one and of two
 periods in a turn; s by a drift and by waves of two and four periods, in which a sample that is not round differs from
 its correction for beam hardening. Opposite views see the same material.
@@ -33,7 +33,7 @@ Image = NDArray[np.float32]
 LEAST_VIEWS = 24
 """Views of which trends are told, at least."""
 MOST_PIXELS = 8_000_000
-"""Pixels that are looked at: fewer views where there are more."""
+"""Pixels of all views together, at most: more would be no look, and are not looked at."""
 GEOMETRY, MOVING, FADING = "geometry", "moving-views", "fading"
 TOLD = 5.0
 """Deviations by which something is told from nothing."""
@@ -86,10 +86,11 @@ def view_trends(
 def _registered(view: Image, left: Image, half_rows: float) -> Floats:
     """Return d to the right, downwards and by a roll, px, and s, of a view and its e (row, column)."""
     rows, columns = view.shape
-    down, right = np.gradient(view)
+    mean = view + left / 2
+    down, right = np.gradient(mean)
     y, x = ((np.arange(count) - (count - 1) / 2) / half_rows for count in (rows, columns))
     roll = y[:, None] * right - x * down
-    ways = np.stack([right, down, roll, view]).reshape(4, -1).astype(float)
+    ways = np.stack([right, down, roll, mean]).reshape(4, -1).astype(float)
     return np.asarray(np.linalg.lstsq(ways @ ways.T, ways @ left.ravel().astype(float))[0])
 
 

@@ -37,7 +37,10 @@ def texture():
 
 
 def left_of(motion_px, share):
-    """Return e of each view (view, row, column), by its definition: moved by (view, 3) px as stored, brighter."""
+    """Return e of each view (view, row, column), by its definition: moved by (view, 3) px as stored, brighter.
+
+    The picture is the mean of a view and its re-projection.
+    """
     picture = texture()
     down, right = np.gradient(picture)
     y, x = np.arange(50)[:, None] - 24.5, np.arange(30)[None, :] - 14.5
@@ -47,7 +50,14 @@ def left_of(motion_px, share):
 
 
 def trends(left):
-    return view_trends(lambda _: texture(), lambda i: left[i].astype(np.float32), ANGLE, TIME, SCALE, 40.0)
+    return view_trends(
+        lambda i: (texture() - left[i] / 2).astype(np.float32),
+        lambda i: left[i].astype(np.float32),
+        ANGLE,
+        TIME,
+        SCALE,
+        40.0,
+    )
 
 
 @MANY
