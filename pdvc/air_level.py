@@ -30,7 +30,7 @@ from scipy import ndimage
 from pdvc.brightness import air_pixels
 from pdvc.experiment import Experiment, Series
 from pdvc.geometry import nearest_angles
-from pdvc.radiographs import IDENTITY, Calibration, binned, detector_noise, grey_levels
+from pdvc.radiographs import IDENTITY, Calibration, binned, detector_noise, grey_levels, grey_of, slope_of
 from pdvc.robust import usual_size
 from pdvc.verdict import Doubt
 
@@ -138,10 +138,9 @@ def _air(stacks: tuple[Series, ...], calibration: Calibration) -> NDArray[np.boo
 
 def worth_voxel(counts: NDArray[np.uint16], calibration: Calibration, source_axis_voxel: float) -> float:
     """Return R epsilon / delta, voxels along the beam, by a radiograph (row, column) of the sample."""
-    c1, c2, c3 = calibration.polynomial
     q = grey_levels(counts, replace(calibration, polynomial=IDENTITY)).astype(float)
-    g, slope = q * (c1 + q * (c2 + q * c3)), c1 + q * (2 * c2 + 3 * c3 * q)
-    return float(source_axis_voxel * (g * slope).sum() / (g**2).sum())
+    g = grey_of(q, calibration.polynomial)
+    return float(source_axis_voxel * (g * slope_of(q, calibration.polynomial)).sum() / (g**2).sum())
 
 
 def doubts_of_air(

@@ -25,6 +25,7 @@ from scipy import ndimage
 from pdvc.geometry import ConeBeam
 from pdvc.progress import Progress, silent
 from pdvc.projection import project_at_rest
+from pdvc.radiographs import grey_of
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import fdk, seen_half_height_mm
 from pdvc.volume import Grid, Hull, Volume, hull_of
@@ -86,20 +87,15 @@ def find_outline(
         before, fitted = fitted, _fit(views, geometry, angle_rad, grid, inside)
         if abs(_half(deepest, fitted) - _half(deepest, before)) < _SETTLED:
             break
-    largest = max(float(_apply(image, fitted).max()) for image in views)
+    largest = max(float(grey_of(image, fitted).max()) for image in views)
     hull = hull_of(inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
     c1, c2, c3 = (c / largest for c in fitted)
     return Outline(hull=hull, polynomial=(c1, c2, c3))
 
 
-def _apply(attenuation: Image, polynomial: tuple[float, float, float]) -> Image:
-    c1, c2, c3 = (np.float32(c) for c in polynomial)
-    return np.asarray(attenuation * (c1 + attenuation * (c2 + attenuation * c3)), dtype=np.float32)
-
-
 def _half(attenuation: float, polynomial: tuple[float, float, float]) -> float:
     """Return the path of half an attenuation over that of the whole: the curve's bend, whatever its scale."""
-    half, whole = _apply(np.array([attenuation / 2, attenuation], dtype=np.float32), polynomial)
+    half, whole = grey_of(np.array([attenuation / 2, attenuation], dtype=np.float32), polynomial)
     return float(half / whole)
 
 
@@ -137,7 +133,7 @@ def _inside(
     """Return the voxels (z, y, x) of the sample: above half its level, pores and graphite filled."""
     everywhere = hull_of(np.ones(grid.shape, dtype=bool), grid, grid.shape[0])
     values = fdk(
-        lambda i: _apply(views[i], polynomial),
+        lambda i: grey_of(views[i], polynomial),
         geometry,
         angle_rad,
         grid,

@@ -12,6 +12,7 @@ with I the counts, D the mean dark and I0 the mean flat. The noise of I follows 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,9 +96,19 @@ def _stands_out(image: Floats) -> NDArray[np.bool_]:
 def grey_levels(counts: NDArray[np.uint16] | Image, calibration: Calibration) -> Image:
     """Turn one radiograph (row, column) of counts into grey levels; bad pixels take their neighbours' mean."""
     _, attenuation = _attenuation(counts, calibration)
-    c1, c2, c3 = (np.float32(c) for c in calibration.polynomial)
-    grey = attenuation * (c1 + attenuation * (c2 + attenuation * c3))
-    return fill(np.asarray(grey, dtype=np.float32), calibration.bad)
+    return fill(grey_of(attenuation, calibration.polynomial), calibration.bad)
+
+
+def grey_of(attenuation: NDArray[Any], polynomial: tuple[float, float, float]) -> NDArray[Any]:
+    """Return g = c1 q + c2 q^2 + c3 q^3, in the precision of the attenuation q."""
+    c1, c2, c3 = (attenuation.dtype.type(c) for c in polynomial)
+    return np.asarray(attenuation * (c1 + attenuation * (c2 + attenuation * c3)))
+
+
+def slope_of(attenuation: NDArray[Any], polynomial: tuple[float, float, float]) -> NDArray[Any]:
+    """Return dg / dq at the attenuation q."""
+    c1, c2, c3 = polynomial
+    return np.asarray(c1 + attenuation * (2 * c2 + 3 * c3 * attenuation))
 
 
 def _attenuation(counts: NDArray[np.uint16] | Image, calibration: Calibration) -> tuple[Image, Image]:
@@ -137,8 +148,7 @@ def detector_noise(experiment: Experiment) -> DetectorNoise | None:
 def grey_noise(counts: NDArray[np.uint16], calibration: Calibration, noise: DetectorNoise) -> tuple[Image, Image]:
     """Return the variance (row, column) of grey levels from the image's own noise, and the slope dg / dq."""
     signal, attenuation = _attenuation(counts, calibration)
-    c1, c2, c3 = calibration.polynomial
-    slope = c1 + attenuation * (2 * c2 + 3 * c3 * attenuation)
+    slope = slope_of(attenuation, calibration.polynomial)
     variance = slope**2 * noise.relative_variance(signal)
     # a dead pixel's counts tell neither: its neighbours' mean stands for both, as for its grey level
     of_noise, of_beam = (fill(np.asarray(each, dtype=np.float32), calibration.bad) for each in (variance, slope))

@@ -33,7 +33,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numba
 import numpy as np
@@ -176,7 +176,7 @@ def _told_apart(found: _Settled, names: Sequence[str], shares: Mapping[str, floa
         # least squares again, with those that were left out at zero
         inverse = np.linalg.inv(found.matrix[np.ix_(left, left)])
         now = inverse @ found.matrix[left] @ values
-        std = np.sqrt(np.diag(inverse @ found.covariance[np.ix_(left, left)] @ inverse))
+        std = _deviations(inverse, found.covariance[np.ix_(left, left)])
         told = {
             k: min(abs(value) / size / TOLD, abs(value) * shares[names[k]] / LEAST_PX)
             for k, value, size in zip(left, now, std, strict=True)
@@ -282,8 +282,7 @@ class _Scan:
             e, rounds, last = self.left(values), rounds + 1, float(np.abs(change).max())
             if last < CONVERGED_PX or rounds == MOST_ROUNDS:
                 break
-        inverse = np.linalg.inv(matrix)
-        std = np.sqrt(np.diag(inverse @ covariance @ inverse))
+        std = _deviations(np.linalg.inv(matrix), covariance)
         return _Settled(
             values=values,
             std=dict(zip(names, std.tolist(), strict=True)),
@@ -317,6 +316,11 @@ def _change(changes: Image, e: Image, unlike: Unlike, now: Floats, deviation: Fl
     ridge = np.diag(variance / deviation**2)
     matrix = matrix + ridge
     return -np.linalg.solve(matrix, gradient + ridge @ now), matrix, covariance + variance * ridge
+
+
+def _deviations(inverse: NDArray[Any], covariance: Floats) -> Floats:
+    """Return the deviations (parameter,) of a solution, by its inverse matrix and its right side's covariance."""
+    return np.asarray(np.sqrt(np.diag(inverse @ covariance @ inverse)))
 
 
 def _scores(change: Image, e: Image) -> Floats:

@@ -20,11 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdvc.identify.integrated import Identified, Radiographs, likeliest, refitted
-from pdvc.identify.laws import law_named
-from pdvc.identify.model import Model
-from pdvc.identify.opening import Ready, largest_MPa
+from pdvc.identify.opening import Ready, nearest, of_kind
 from pdvc.identify.result import STRONG
-from pdvc.identify.two_step import unweighted, zeroed
 from pdvc.progress import Progress, silent
 from pdvc.smoother import seen
 
@@ -68,20 +65,15 @@ def choices(
     """Return the choices of made-up tests, some draws of each law: the one asked for, which was found, and others."""
     asked = opened.model
     kinds = (str(asked.law.kind), *(kind for kind in others if kind != asked.law.kind))
-    models = [asked, *(_of_kind(asked, opened, kind) for kind in kinds[1:])]
-    flat = zeroed(opened.amplitude, opened.loaded)
+    models = [asked, *(of_kind(opened, kind) for kind in kinds[1:])]
     vectors = [found.estimate.vector]
     for model in models[1:]:
-        start = unweighted(model, flat, opened.seen, found.force_N, opened.sections).vector
+        start = nearest(opened, model, opened.amplitude, found.force_N)
         vectors.append(likeliest(model, opened.force_N, start, radiographs, found.deviations)[0])
     rest, evidence = found.amplitude - found.of_law, np.empty((len(kinds), draws, len(kinds)))
     for k, (model, vector) in enumerate(zip(models, vectors, strict=True)):
         motion = model.amplitude(vector, found.force_N)
-        plain = zeroed(motion, opened.loaded)
-        starts = [
-            vector if other is model else unweighted(other, plain, opened.seen, found.force_N, opened.sections).vector
-            for other in models
-        ]
+        starts = [vector if other is model else nearest(opened, other, motion, found.force_N) for other in models]
         made = _made_up(rest + motion, found.force_N, asked.force_noise_N, radiographs, np.random.default_rng(k))
         for n in range(draws):
             seen_now, force_N = next(made)
@@ -90,10 +82,6 @@ def choices(
                 evidence[k, n, j] = likeliest(other, force_N, start, seen_now, deviations)[1]
             progress("made-up tests", k * draws + n + 1, len(kinds) * draws)
     return Choices(kinds=kinds, log_evidence=evidence)
-
-
-def _of_kind(model: Model, opened: Ready, kind: str) -> Model:
-    return replace(model, law=law_named(kind).started_for(largest_MPa(opened.force_N, model.profile)))
 
 
 def _made_up(

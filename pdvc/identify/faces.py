@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from pdvc.geometry import ConeBeam
 from pdvc.identify.outline import Outline, areas_of, around, directions_rad, falls, radii
-from pdvc.radiographs import sharpened, smoothed
+from pdvc.radiographs import grey_of, sharpened, smoothed
 from pdvc.rays import directions
 from pdvc.reconstruction import fdk
 from pdvc.volume import DIRECTIONS, Grid, Hull
@@ -137,20 +137,15 @@ def seen_by_pixels(grey: Floats, scan: Scan, blur_px: float) -> Image:
     if blur_px > 0:
         intensity = ndimage.gaussian_filter1d(intensity, blur_px * SUBPIXELS, axis=1, mode="nearest")
     pixels = -np.log(intensity.reshape(len(grey), -1, SUBPIXELS).mean(axis=2))
-    return _grey(pixels, scan.polynomial).astype(np.float32)
-
-
-def _grey(attenuation: Floats, polynomial: tuple[float, float, float]) -> Floats:
-    c1, c2, c3 = polynomial
-    return np.asarray(attenuation * (c1 + attenuation * (c2 + attenuation * c3)))
+    return np.asarray(grey_of(pixels, scan.polynomial), dtype=np.float32)
 
 
 def _attenuation(grey: Floats, polynomial: tuple[float, float, float]) -> Floats:
     """Return the attenuations that a rising polynomial makes grey levels of."""
     most, highest = float(grey.max()), 1.0
     for _ in range(_DOUBLINGS):
-        if _grey(np.array(highest), polynomial) >= most:
+        if grey_of(np.array(highest), polynomial) >= most:
             break
         highest *= 2
     curve = np.linspace(0.0, highest, _CURVE_POINTS)
-    return np.interp(grey, np.maximum.accumulate(_grey(curve, polynomial)), curve)
+    return np.interp(grey, np.maximum.accumulate(grey_of(curve, polynomial)), curve)

@@ -86,6 +86,18 @@ def largest_MPa(force_N: Floats, profile: Profile) -> float:
     return float(force_N.max() / profile.area_mm2.min())
 
 
+def of_kind(opened: Ready, kind: str) -> Model:
+    """Return the model with a law of another kind, started for this test."""
+    law = law_named(kind).started_for(largest_MPa(opened.force_N, opened.model.profile))
+    return replace(opened.model, law=law)
+
+
+def nearest(opened: Ready, model: Model, amplitude: Floats, force_N: Floats) -> Floats:
+    """Return the unknowns (unknown,) whose law is nearest to amplitudes (step, unknown) at forces (step,): a start."""
+    flat = zeroed(amplitude, opened.loaded)
+    return unweighted(model, flat, opened.seen, force_N, opened.sections).vector
+
+
 def ready(
     experiment: Experiment,
     measurement: Measurement,

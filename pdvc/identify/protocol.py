@@ -14,12 +14,11 @@ from pdvc.identify.beam import elongation_mm
 from pdvc.identify.choice import Choices, choices
 from pdvc.identify.crosshead import from_crosshead
 from pdvc.identify.integrated import Identified, Radiographs, carried_by, integrated, log_evidence, radiographs_at
-from pdvc.identify.laws import law_named
 from pdvc.identify.model import Model
-from pdvc.identify.opening import Ready, largest_MPa, ready
+from pdvc.identify.opening import Ready, nearest, of_kind, ready
 from pdvc.identify.options import IdentifyOptions
 from pdvc.identify.result import CROSSHEAD, INTEGRATED, UNWEIGHTED, Found, Identification
-from pdvc.identify.two_step import LawEstimate, unweighted, zeroed
+from pdvc.identify.two_step import LawEstimate
 from pdvc.measurement import Measurement
 from pdvc.progress import Progress, silent
 from pdvc.protocol import versions
@@ -111,8 +110,7 @@ def choice(
     if not options.compare:
         raise ValueError("compare: expected some laws to choose among, found none")
     opened = ready(experiment, measurement, options, work=work, progress=progress)
-    flat = zeroed(opened.amplitude, opened.loaded)
-    start = unweighted(opened.model, flat, opened.seen, opened.force_N, opened.sections).vector
+    start = nearest(opened, opened.model, opened.amplitude, opened.force_N)
     found, radiographs = _integrated(opened, start)
     return choices(opened, radiographs, found, options.compare, draws, progress=progress)
 
@@ -161,13 +159,11 @@ def _compared(opened: Ready, found: Identified, radiographs: Radiographs) -> dic
     others = [other for other in opened.options.compare if other != kind]
     if not others:
         return {}
-    flat = zeroed(opened.amplitude, opened.loaded)
     own = log_evidence(opened.model, opened.force_N, found.estimate.vector, radiographs, found.deviations)
     result = {kind: 0.0}
     for other in others:
-        law = law_named(other).started_for(largest_MPa(opened.force_N, opened.model.profile))
-        model = replace(opened.model, law=law)
-        start = unweighted(model, flat, opened.seen, found.force_N, opened.sections).vector
+        model = of_kind(opened, other)
+        start = nearest(opened, model, opened.amplitude, found.force_N)
         result[other] = log_evidence(model, opened.force_N, start, radiographs, found.deviations) - own
     return result
 

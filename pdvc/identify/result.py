@@ -123,14 +123,20 @@ class Identification:
             for value, vector in zip(values[::-1], vectors.T[::-1], strict=True)
         ]
 
+    def better(self) -> tuple[str, float] | None:
+        """Return the law that explains the test better by a strong difference of log evidence, and this; else None."""
+        if not self.log_evidence:
+            return None
+        best = max(self.log_evidence, key=lambda kind: self.log_evidence[kind])
+        more = self.log_evidence[best] - self.log_evidence[self.law]
+        return (best, more) if more > STRONG else None
+
     def doubts(self) -> tuple[str, ...]:
         """Return what speaks against the law, and what it was not seen of."""
-        said = []
-        if self.log_evidence:
-            best = max(self.log_evidence, key=lambda kind: self.log_evidence[kind])
-            more = self.log_evidence[best] - self.log_evidence[self.law]
-            if more > STRONG:
-                said.append(f"the law {best} explains the test better than {self.law}, by {more:.1f} in log evidence")
+        said, better = [], self.better()
+        if better is not None:
+            best, more = better
+            said.append(f"the law {best} explains the test better than {self.law}, by {more:.1f} in log evidence")
         for name, share in self.seen().items():
             if share > SEEN:
                 said.append(f"{name} is not seen: {share:.0%} of its prior deviation are left")

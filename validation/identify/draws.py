@@ -14,7 +14,7 @@ deviations once more, from those of the first.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -126,10 +126,8 @@ class Draw:
     @property
     def score_columns(self) -> Mapping[str, type]:
         """Return names and types of the scores."""
-        names = tuple(self.options.law.values())
-        found = (f"{method}:{name}{what}" for method in METHODS for name in names for what in ("", "_deviation"))
         others = ("area_error", "share", "share_deviation", *(f"seconds_{part}" for part in (*METHODS, "ready")))
-        return dict.fromkeys((*found, *others), float)
+        return dict.fromkeys((*estimated(self.options.law.values()), *others), float)
 
     def parts(self) -> tuple[Part, ...]:
         """Return the clean stacks, and the first draw."""
@@ -192,6 +190,11 @@ def draws(scenario: Scenario, options: IdentifyOptions, count: int) -> list[Draw
     first = First(scenario, told)
     changes = ({"seed": scenario.seed + n, "repetition": n} for n in range(1, count + 1))
     return [Draw(scenario=scenario.model_copy(update=each), first=first) for each in changes]
+
+
+def estimated(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns of what every method makes of a law's parameters: logarithms, and their deviations."""
+    return tuple(f"{method}:{name}{what}" for method in METHODS for name in names for what in ("", "_deviation"))
 
 
 def _grouped(path: Path) -> dict[str, Any]:

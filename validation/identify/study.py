@@ -15,12 +15,12 @@ from pdvc.experiment import Experiment
 from pdvc.identify.laws import law_named
 from pdvc.identify.options import IdentifyOptions
 from pdvc.identify.protocol import identify
-from pdvc.identify.result import STRONG, Identification
+from pdvc.identify.result import Identification
 from pdvc.measurement import Measurement
 from pdvc.protocol import measure
 from validation.batch.engine import Part, Result, Scalar
 from validation.batch.trial import Trial, Volumes, clean_parts, simulated
-from validation.identify.draws import METHODS
+from validation.identify.draws import METHODS, estimated
 from validation.identify.recovery import recovery
 from validation.study.description import Study
 from validation.study.summary import by_combination
@@ -51,8 +51,7 @@ class IdentifiedTrial:
     def score_columns(self) -> Mapping[str, type]:
         """Return names and types of the scores."""
         names = law_named(self.laws[0]).values()
-        found = (f"{method}:{name}{what}" for method in METHODS for name in names for what in ("", "_deviation"))
-        numbers = (*found, *(f"seconds_{method}" for method in METHODS), AHEAD)
+        numbers = (*estimated(names), *(f"seconds_{method}" for method in METHODS), AHEAD)
         return {
             **dict.fromkeys(numbers, float),
             CHOSEN: str,
@@ -81,7 +80,7 @@ class IdentifiedTrial:
         scores[CHOSEN] = max(evidence, key=lambda kind: evidence[kind])
         scores[AHEAD] = -max((value for kind, value in evidence.items() if kind != best.law), default=float("nan"))
         for kind, each_law in found.items():
-            scores[f"{kind}_doubted"] = _is_doubted(each_law)
+            scores[f"{kind}_doubted"] = each_law.better() is not None
         return Result(scores=scores)
 
     def _asked(
@@ -122,9 +121,3 @@ def recovery_of(study: Study, trials: Sequence[Trial], table: pd.DataFrame) -> t
             }
         )
     return pd.concat(recovered, ignore_index=True), pd.DataFrame(said)
-
-
-def _is_doubted(found: Identification) -> bool:
-    """Return whether another law is better than the one that was asked for, as `Identification.doubts` says it."""
-    own = found.log_evidence.get(found.law, 0.0)
-    return any(value - own > STRONG for value in found.log_evidence.values())

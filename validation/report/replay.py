@@ -56,7 +56,6 @@ def write_replay(path: Path, steps: Steps, *, most_bytes: int = MOST_BYTES, prog
         # bytes go with the number of pixels, so that this is nearly always enough
         wanted = int(np.ceil(pictures.binning * np.sqrt(pictures.size / most_bytes)))
         pictures = pictures_of(steps, min(max(wanted, pictures.binning + 1), COARSEST), progress)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, page_of(steps, pictures).encode())
     return pictures
 

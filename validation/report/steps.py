@@ -17,11 +17,10 @@ from validation.report.figures import scale_limit
 from validation.report.pictures import of_volumes, selected_steps
 from validation.scoring.centre_line import TruePoints, centre_line
 from validation.scoring.deviations import centre_line_deviation
+from validation.view.state import HALF_95
 
 Floats = NDArray[np.float64]
 
-HALF_95 = 1.96
-"""Half of a 95 % interval, in standard deviations."""
 USUAL = 0.98
 """Share of the bands that the axis of a profile holds whole: a few, where little is known, would take it all up."""
 
