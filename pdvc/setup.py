@@ -211,7 +211,7 @@ def _corrected(experiment: Experiment, options: MeasureOptions, store: Store, pr
         )
         return {"correction": np.array(text_of(correction))}
 
-    kept = store.of_reference("self-calibration", (sought, options.beam_hardening), found)
+    kept = store.of_reference("self-calibration", (sought, options.beam_hardening, options.brightness), found)
     return correction_of(str(kept["correction"]))
 
 

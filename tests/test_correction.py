@@ -26,6 +26,7 @@ from pdvc.measurement_file import read_measurement, write_measurement
 from pdvc.protocol import measure
 from pdvc.radiographs import calibrate, grey_levels
 from pdvc.rays import ray_vectors
+from pdvc.setup import set_up
 from tests.command_line import only_line, pdvc_bench
 from tests.spheres import BEAM, experiment
 from validation.testing.small_cases import SmallExperiment, small_scenario
@@ -146,6 +147,17 @@ def test_a_correction_is_kept_as_a_text():
     )
     assert text_of(correction_of(text_of(here))) == text_of(here)
     assert "roll: +0.100 +- 0.010 px" in here.lines
+
+
+def test_what_was_found_by_other_grey_levels_is_not_taken_for_this(tmp_path, monkeypatch):
+    """A folder keeps a correction for the options that it depends on: the beam of the views is one."""
+    none, asked = Correction(parameters=(), rounds=1, last_change_px=0.0, rms_before=0.1, rms_after=0.1), []
+    monkeypatch.setattr("pdvc.setup.self_calibrated", lambda *_, **__: asked.append(1) or none)
+    small = SmallExperiment(small_scenario())
+    for brightness, times in (("flats", 1), ("air", 2), ("flats", 2)):
+        changes = {"self_calibration": "geometry", "brightness": brightness}
+        set_up(small.experiment, small.options.model_copy(update=changes), work=tmp_path)
+        assert len(asked) == times
 
 
 def test_a_measurement_with_a_wrong_axis_is_that_with_the_right_one(tmp_path):
