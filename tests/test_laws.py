@@ -37,7 +37,7 @@ from validation.scoring.scores import point_errors
 from validation.testing.small_cases import SmallExperiment
 from validation.testing.strategies import small_experiments
 
-THROUGH = law(3, cost=10)
+THROUGH = law(2, cost=10)
 """A law through the whole pipeline costs some two seconds an example; the first is the plainest that there is."""
 
 moving_experiments = small_experiments(least_ingredients=5)
