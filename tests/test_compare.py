@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from pdvc.settings import SettingsError
 from simulator.scenario import Scenario
 from tests.command_line import install, only_line, pdvc_bench
-from tests.tiny_scenarios import TINY
+from tests.tiny_scenarios import SHORT
 from validation.compare.comparison import Comparison, with_scans
 from validation.compare.figures import Point, cost_figure, draw_cost, draw_steps, steps_figure, style_of
 from validation.compare.paired import QUANTITIES
@@ -22,11 +22,9 @@ from validation.methods.registry import Method
 from validation.report.figures import new_figure
 from validation.scoring.bootstrap import Estimate
 
-SMALL = TINY.replace("reference_views = 60", "reference_views = 36").replace("test_steps = 25", "test_steps = 14")
-
 
 def tiny(**changes):
-    values = tomllib.loads(SMALL)
+    values = tomllib.loads(SHORT)
     for key, value in changes.items():
         values[key] = {**values.get(key, {}), **value} if isinstance(value, dict) else value
     return Scenario.parse(values, where="tiny")
@@ -263,12 +261,12 @@ WRONG = Method(name="wrong", measure=wrong, assumes="Assume that a number will d
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    """Compare three made-up methods as a user does it, twice; the tests below look at what that left."""
+def done(tmp_path_factory, address):
+    """Compare made-up methods as a user does it, and again in this process; tests below look at what that left."""
     folder = tmp_path_factory.mktemp("compare")
     methods = {name: f"made_up_methods:{name.upper()}" for name in ("every", "few", "broken", "wrong")}
     install(folder, methods, MODULE, name="made_up_methods")
-    (folder / "tiny.toml").write_text(SMALL)
+    (folder / "tiny.toml").write_text(SHORT)
     arguments = ("compare", folder / "tiny.toml", "--methods", "every,few,broken,wrong", "-o", folder / "out")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
@@ -278,7 +276,7 @@ def done(tmp_path_factory):
         diary = [json.loads(line) for line in (folder / "diary").read_text().splitlines()]
         page = (folder / "out" / "comparison.html").read_text()
         (folder / "diary").unlink()
-        again = pdvc_bench(*arguments, "--repetitions", 2, "--workers", 1)
+        again = pdvc_bench(*arguments, "--repetitions", 2, "--scheduler", address)
         assert again.exit_code == 0, again.stderr
         repeated = [json.loads(line)["method"] for line in (folder / "diary").read_text().splitlines()]
     return folder / "out", first, diary, page, repeated

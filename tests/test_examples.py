@@ -16,7 +16,7 @@ import pytest
 from pdvc.record import MeasurementLine, read_record
 from tests.command_line import install
 from tests.followed_tests import ALARM, OVER, PLAN, step
-from tests.tiny_scenarios import TINY
+from tests.tiny_scenarios import SHORT
 from validation.methods.registry import GROUP, find_method
 from validation.scoring.scores import score
 from validation.testing.small_cases import SmallExperiment, small_scenario
@@ -77,8 +77,7 @@ def test_a_study_is_run_from_python(tmp_path, monkeypatch, capsys):
 
 
 def test_a_test_is_played_followed_and_shown_and_nothing_is_left_running(tmp_path):
-    fewer = TINY.replace("test_steps = 25", "test_steps = 14").replace("plateau_steps = 10", "plateau_steps = 6")
-    (tmp_path / "tiny.toml").write_text(fewer)
+    (tmp_path / "tiny.toml").write_text(SHORT.replace("plateau_steps = 10", "plateau_steps = 6"))
     command = [sys.executable, EXAMPLES / "follow_a_test.py", tmp_path / "out", tmp_path / "tiny.toml", "0"]
     # ends only once all that it began have closed what they print to
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, cwd=ROOT)

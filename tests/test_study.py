@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import shutil
 from pathlib import Path
 
-import dask
 import numpy as np
 import pandas as pd
 import pytest
-from distributed import LocalCluster
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -278,18 +275,6 @@ def test_the_extensions_of_the_capture_study_are_those_of_its_motion():
         low, high = course.motion.forward(np.array([[0, 0, -view], [0, 0, view]]), len(course.test_time_s) - 1)
         extension_mm = high[2] - low[2] - 2 * view
         assert extension_mm / scenario.geometry.cone_beam().voxel_mm == pytest.approx(voxels, rel=0.02)
-
-
-@pytest.fixture(scope="module")
-def address():
-    """Return the address of a scheduler whose one worker is this process, which has its kernels loaded."""
-    with (
-        dask.config.set({"distributed.worker.profile.enabled": False}),  # it looks on a hundred times a second
-        LocalCluster(
-            n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0", silence_logs=logging.CRITICAL
-        ) as cluster,
-    ):
-        yield cluster.scheduler_address
 
 
 @pytest.fixture(scope="module")

@@ -38,6 +38,34 @@ stroke_mm_per_s = 0.01
 """
 """An experiment of 119 x 54 px that is simulated and measured in a few seconds."""
 
+SHORT = """
+name = "tiny"
+title = "Smaller still, and with fewer steps"
+discarded_rows = 8
+
+[graphite]
+mean_diameter_mm = 0.4
+smallest_diameter_mm = 0.3
+largest_diameter_mm = 0.6
+gap_mm = 0.016
+
+[geometry]
+pixel_mm = 4.8
+rows = 60
+columns = 28
+
+[acquisition]
+reference_views = 36
+test_steps = 14
+steps_per_turn = 10
+subpixels = 2
+
+[loading]
+plateau_steps = 10
+stroke_mm_per_s = 0.01
+"""
+"""An experiment of 60 x 28 px, for commands of which only their course counts."""
+
 FAST = {
     "rigid": (StageOptions(scale="coarse", solver=Pgd(most_modes=2)),),
     "deformation": (StageOptions(scale=1, solver=Pgd(most_modes=2)),),
