@@ -317,7 +317,8 @@ class _Sized(SimpleNamespace):
 
 def test_a_laboratory_plans_from_its_reference_scan(tmp_path):
     """The folder of an experiment whose test is still to be made: its radiographs are not there."""
-    (tmp_path / "tiny.toml").write_text(TINY.replace("reference_views = 60", "reference_views = 36"))
+    fewer = TINY.replace("2.3968", "3.6").replace("rows = 119", "rows = 80").replace("columns = 54", "columns = 36")
+    (tmp_path / "tiny.toml").write_text(fewer)
     assert pdvc_bench("simulate", tmp_path / "tiny.toml", "-o", tmp_path / "experiment").exit_code == 0
     (tmp_path / "experiment" / "test" / "radiographs.tif").unlink()
     found = pdvc_bench("plan", tmp_path / "experiment", "-o", tmp_path / "real.csv")
