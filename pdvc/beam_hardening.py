@@ -4,10 +4,23 @@ A polychromatic beam loses its soft part first, so that attenuation q grows less
 sample. With the sample's outline found in a coarse volume, L is known for every ray. Nodules and photons scatter q,
 and not L: q is fitted to L by least squares, and the curve is turned round,
 
-    q ~ a1 L + a2 L^2 + a3 L^3        L ~ c1 q + c2 q^2 + c3 q^3     (third order, as in section 4.1)
+    q ~ a1 L + a2 L^2 + a3 L^3 + (b1 + b2 L) D        L ~ c1 q + c2 q^2 + c3 q^3     (third order, as in section 4.1)
 
 (fitted to q, L would come out flatter than it is). Divided by its largest value in the reference views L gives grey
 levels from 0 to 1. The outline of an uncorrected volume is off, so that outline and fit are repeated until they stay.
+
+D is the path through what is seen to be lighter inside, nodules or pores. Where it makes up another share of long
+paths than of short ones, as nodules that stay clear of the faces do, the curve of all rays is not that of a section
+which becomes thinner as a whole: D is left out once it is fitted.
+
+L is as exact as the faces are. A voxel at a face counts by the share that the sample takes of it, which the grey level
+over that behind the face tells. But a pixel shows the mean of intensities: covered to a share c, with the attenuation
+a of a path along the face behind it, it shows s = -ln(1 - c (1 - exp(-a))) / a < c, which is turned round,
+
+    c = (1 - exp(-a s)) / (1 - exp(-a)).
+
+Where n x n pixels are averaged after their logarithm this happens in a strip n times as narrow: a / n stands for a,
+which moves a face alike as long as a is small (a / 12 of a pixel).
 
 The slope counts most: as a stretched section becomes thinner, grey levels follow dL/dq, and where these fall by
 another share than lengths do the sample seems to contract, or to move along the beam.
@@ -43,6 +56,10 @@ _ALIKE = 0.8
 than the attenuation of its mean path."""
 _FEWEST = 1000
 """Pixels away from edges that are enough."""
+_LIGHT = 0.5
+"""Share of the sample's grey level below which a voxel inside holds something lighter."""
+_RIM, _SKIN = 1, 2
+"""Voxels on both sides of a face that hold a share of the sample, and voxels behind it that tell its level."""
 _CURVE_POINTS = 200
 _ROUNDS = 8
 """Times that outline and polynomial are found in turn, at most."""
@@ -60,17 +77,46 @@ class Outline:
     """c1, c2, c3: from attenuation to grey levels, 1 at the largest attenuation."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Sample:
+    """The sample in a coarse volume."""
+
+    inside: NDArray[np.bool_]
+    """Its voxels (z, y, x): above half its level, pores and graphite filled."""
+    values: NDArray[np.float32]
+    """Grey levels (z, y, x), per mm."""
+    level: float
+    """Its own."""
+
+    @property
+    def lighter(self) -> NDArray[np.bool_]:
+        """Return the voxels (z, y, x) of what is lighter inside: nodules, pores."""
+        return np.asarray(ndimage.binary_erosion(self.inside) & (self.values < _LIGHT * self.level))
+
+    def share(self, attenuation: float) -> NDArray[np.float32]:
+        """Return the share of each voxel (z, y, x) that the sample takes, for the attenuation along its faces."""
+        core = ndimage.binary_erosion(self.inside, iterations=_RIM)
+        rim = ndimage.binary_dilation(self.inside, iterations=_RIM) & ~core
+        skin = ndimage.binary_erosion(self.inside) & ~ndimage.binary_erosion(self.inside, iterations=1 + _SKIN)
+        level = float(np.median(self.values[skin])) if skin.any() else self.level
+        result = core.astype(np.float32)
+        result[rim] = np.expm1(-attenuation / level * self.values[rim]) / np.expm1(-attenuation)
+        return np.asarray(result)
+
+
 def find_outline(
     view: Callable[[int], Image],
     geometry: ConeBeam,
     angle_rad: Floats,
     polynomial: tuple[float, float, float] | None,
     *,
+    binned: int = 1,
     progress: Progress = silent,
 ) -> Outline:
     """Reconstruct coarsely, outline the sample and fit the polynomial, unless one is given.
 
-    `view(i)` returns the attenuation (row, column) of coarse view i, without unit; `geometry` is theirs.
+    `view(i)` returns the attenuation (row, column) of coarse view i, without unit; `geometry` is theirs, and `binned`
+    the pixels along an axis that were averaged into one of theirs after their logarithm.
     A given polynomial is only scaled, so that the largest attenuation becomes 1. Raises ValueError where it falls
     somewhere: then grey levels do not tell attenuations.
     """
@@ -81,14 +127,14 @@ def find_outline(
     fitted = polynomial or (1.0, 0.0, 0.0)
     deepest = max(float(image.max()) for image in views)
     for _ in range(_ROUNDS):
-        inside = _inside(views, geometry, angle_rad, grid, fitted, progress)
+        sample = _sample(views, geometry, angle_rad, grid, fitted, progress)
         if polynomial is not None:
             break
-        before, fitted = fitted, _fit(views, geometry, angle_rad, grid, inside)
+        before, fitted = fitted, _fit(views, geometry, angle_rad, grid, sample, binned)
         if abs(_half(deepest, fitted) - _half(deepest, before)) < _SETTLED:
             break
     largest = max(float(grey_of(image, fitted).max()) for image in views)
-    hull = hull_of(inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
+    hull = hull_of(sample.inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
     c1, c2, c3 = (c / largest for c in fitted)
     return Outline(hull=hull, polynomial=(c1, c2, c3))
 
@@ -122,15 +168,15 @@ def _whole_grid(geometry: ConeBeam) -> Grid:
     return Grid.around(np.array([-radius, -radius, -height]), np.array([radius, radius, height]), geometry.voxel_mm)
 
 
-def _inside(
+def _sample(
     views: list[Image],
     geometry: ConeBeam,
     angle_rad: Floats,
     grid: Grid,
     polynomial: tuple[float, float, float],
     progress: Progress,
-) -> NDArray[np.bool_]:
-    """Return the voxels (z, y, x) of the sample: above half its level, pores and graphite filled."""
+) -> _Sample:
+    """Return the sample as a volume shows it."""
     everywhere = hull_of(np.ones(grid.shape, dtype=bool), grid, grid.shape[0])
     values = fdk(
         lambda i: grey_of(views[i], polynomial),
@@ -141,7 +187,8 @@ def _inside(
         progress=progress,
         task="outline",
     )
-    inside = ndimage.binary_fill_holes(values > 0.5 * _sample_level(values))
+    level = _sample_level(values)
+    inside = ndimage.binary_fill_holes(values > 0.5 * level)
     labels, count = ndimage.label(inside)
     if count == 0:
         raise ValueError("radiographs of a full scan: expected a sample, found only air")
@@ -151,7 +198,7 @@ def _inside(
             "radiographs of a full scan: expected a sample, found only air: "
             f"{count} scattered parts, the largest with {sizes.max() / sizes.sum():.0%} of their volume"
         )
-    return np.asarray(labels == 1 + int(sizes.argmax()))
+    return _Sample(inside=np.asarray(labels == 1 + int(sizes.argmax())), values=values, level=level)
 
 
 def _sample_level(values: NDArray[np.float32]) -> float:
@@ -167,33 +214,40 @@ def _sample_level(values: NDArray[np.float32]) -> float:
 
 
 def _fit(
-    views: list[Image], geometry: ConeBeam, angle_rad: Floats, grid: Grid, inside: NDArray[np.bool_]
+    views: list[Image], geometry: ConeBeam, angle_rad: Floats, grid: Grid, sample: _Sample, binned: int
 ) -> tuple[float, float, float]:
     """Return path length, mm, as a polynomial of attenuation, from the middle rows of some views."""
-    hull = hull_of(inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
-    volume = Volume(values=_framed_copy(inside), grid=grid, hull=hull)
+    hull = hull_of(sample.inside, grid, SLAB_VOXELS).grown((1 + _RIM) * grid.voxel_mm)
     middle = slice(geometry.rows // 5, geometry.rows - geometry.rows // 5)
     window = geometry.cropped(middle.start, middle.stop, 0, geometry.columns)
-    lengths, attenuations, alike = [], [], []
-    for i in np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int)):
-        rays = ray_vectors(window, angle_rad[i]).stacked()
-        length = project_at_rest(volume, rays, (window.rows, window.columns))[0]
-        lengths.append(length.ravel())
-        attenuations.append(views[i][middle].ravel())
-        alike.append((ndimage.minimum_filter1d(length, 3) >= _ALIKE * ndimage.maximum_filter1d(length, 3)).ravel())
-    length, q = np.concatenate(lengths).astype(float), np.concatenate(attenuations).astype(float)
-    powers, longest = np.arange(1, 4), length.max()
-    deep = length > _DEEP * longest
-    even = deep & np.concatenate(alike)
+    chosen = np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int))
+    seen = np.stack([views[i][middle] for i in chosen])
+    # half of the largest attenuation, or more, is that of a path along a face
+    along_a_face = float(np.median(seen[seen > seen.max() / 2]))
+    rays = ray_vectors(window, angle_rad[chosen]).stacked()
+
+    def paths(share: NDArray[np.float32]) -> Image:
+        """Return the paths (view, row, column), mm, through voxels (z, y, x), each by its share."""
+        volume = Volume(values=_framed(share), grid=grid, hull=hull)
+        return project_at_rest(volume, rays, (window.rows, window.columns))
+
+    length = paths(sample.share(along_a_face / binned))
+    lighter = paths(sample.lighter.astype(np.float32))
+    deep = length > _DEEP * length.max()
+    alike = ndimage.minimum_filter1d(length, 3) >= _ALIKE * ndimage.maximum_filter1d(length, 3)
     # a sample of a few pixels is all edge
-    used = even if np.count_nonzero(even) >= _FEWEST else deep
-    a = np.linalg.lstsq(length[used, None] ** powers, q[used], rcond=None)[0]
+    used = deep & alike if np.count_nonzero(deep & alike) >= _FEWEST else deep
+    path, light, powers = length[used].astype(float), lighter[used].astype(float), np.arange(1, 4)
+    shapes = np.column_stack([path[:, None] ** powers, light, light * path])
+    a = np.linalg.lstsq(shapes, seen[used].astype(float), rcond=None)[0][:3]
+    longest = float(length.max())
     curve = np.linspace(_DEEP * longest, longest, _CURVE_POINTS)
     c1, c2, c3 = np.linalg.lstsq((curve[:, None] ** powers @ a)[:, None] ** powers, curve, rcond=None)[0]
     return float(c1), float(c2), float(c3)
 
 
-def _framed_copy(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    values = np.zeros(inside.shape, dtype=np.float32)
-    values[1:-1, 1:-1, 1:-1] = inside[1:-1, 1:-1, 1:-1]
-    return values
+def _framed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return values (z, y, x) with one layer of zeros on every face."""
+    result = np.zeros_like(values)
+    result[1:-1, 1:-1, 1:-1] = values[1:-1, 1:-1, 1:-1]
+    return result

@@ -254,7 +254,9 @@ def outlined(
         return binned(grey_levels(series.counts[chosen[i]], calibration), factor)
 
     def found() -> dict[str, Floats]:
-        outline = find_outline(view, geometry.binned(factor), series.angle_rad[chosen], polynomial, progress=progress)
+        outline = find_outline(
+            view, geometry.binned(factor), series.angle_rad[chosen], polynomial, binned=factor, progress=progress
+        )
         hull = outline.hull
         return {
             "place_mm": np.array([hull.z_mm, hull.slab_mm]),
