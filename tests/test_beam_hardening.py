@@ -104,6 +104,18 @@ def test_pixels_that_average_intensities_move_no_face():
     assert np.abs(slopes(found.polynomial, np.max(lengths)) - 1).max() < 0.05
 
 
+def test_nor_do_pixels_whose_attenuations_are_averaged():
+    scanner = replace(SCANNER, pixel_mm=1.0, rows=24, columns=26)
+    lengths = list(chords_across(scanner))
+    views = np.mean([attenuation(each) for each in lengths], axis=0).astype(np.float32)
+
+    def off(binned):
+        found = find_outline(lambda i: views[i], scanner, ANGLES, None, binned=binned)
+        return np.abs(slopes(found.polynomial, np.max(lengths)) - 1).max()
+
+    assert off(5) < 0.04 < off(1)
+
+
 def test_a_sample_of_a_few_pixels_is_all_edge_and_still_has_a_curve():
     views = attenuation(chords(half=np.array([0.05, 0.04]))).astype(np.float32)
     found = find_outline(lambda i: views[i], SCANNER, ANGLES, None)
