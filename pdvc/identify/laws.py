@@ -207,7 +207,8 @@ def plastic_at(law: Law, stress_MPa: ArrayLike) -> Floats:
         left = law.flow_MPa(p) - wanted
         low, high = np.where(left < 0, x, low), np.where(left < 0, high, x)
         newton = x - left / np.maximum(law.slope_MPa(p) * p, _LEAST_SLOPE_MPA)
-        inside = (newton > low) & (newton < high)
+        # at its end Newton stays where it is, which is a bound by then
+        inside = (newton >= low) & (newton <= high)
         moved = np.where(inside, newton, (low + high) / 2)
         done = np.max(np.abs(moved - x), initial=0.0) < _CLOSE
         x = moved
