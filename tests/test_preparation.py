@@ -90,7 +90,8 @@ def test_views_are_sharpened_for_the_volume_alone():
         model = project_at_rest(each.images.volume, rays, each.systematic.detector)[0]
         left = each.systematic.left(7)
         reached = left.any(axis=1)
-        np.testing.assert_allclose(left[reached], (model - each.view(7))[reached], atol=1e-5)
+        # kept to eleven bits
+        np.testing.assert_allclose(left[reached], (model - each.view(7))[reached], rtol=2**-11, atol=1e-5)
         first, rows = each.systematic.corner[0], each.systematic.shape[0]
         assert reached[first : first + rows].all()
 
