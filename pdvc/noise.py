@@ -48,7 +48,7 @@ Image = NDArray[np.float32]
 
 SOURCES = ("radiographs", "views", "flats")
 """Where noise comes from."""
-BELIEF = 0.05
+BELIEF = 0.08
 """Share of e that it may be wrong by, alike everywhere: what re-projection leaves of paths a little other than those
 of the reference scan is known no better."""
 
