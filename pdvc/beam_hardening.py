@@ -41,7 +41,7 @@ from pdvc.projection import project_at_rest
 from pdvc.radiographs import grey_of
 from pdvc.rays import ray_vectors
 from pdvc.reconstruction import fdk, seen_half_height_mm
-from pdvc.volume import Grid, Hull, Volume, hull_of
+from pdvc.volume import Grid, Hull, Volume, framed, hull_of
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -58,8 +58,8 @@ _FEWEST = 1000
 """Pixels away from edges that are enough."""
 _LIGHT = 0.5
 """Share of the sample's grey level below which a voxel inside holds something lighter."""
-_RIM, _SKIN = 1, 2
-"""Voxels on both sides of a face that hold a share of the sample, and voxels behind it that tell its level."""
+_SKIN = 2
+"""Voxels behind those of a face that tell the level there."""
 _CURVE_POINTS = 200
 _ROUNDS = 8
 """Times that outline and polynomial are found in turn, at most."""
@@ -89,19 +89,24 @@ class _Sample:
     """Its own."""
 
     @property
+    def core(self) -> NDArray[np.bool_]:
+        """Return the voxels (z, y, x) behind those of its faces."""
+        return np.asarray(ndimage.binary_erosion(self.inside))
+
+    @property
     def lighter(self) -> NDArray[np.bool_]:
         """Return the voxels (z, y, x) of what is lighter inside: nodules, pores."""
-        return np.asarray(ndimage.binary_erosion(self.inside) & (self.values < _LIGHT * self.level))
+        return np.asarray(self.core & (self.values < _LIGHT * self.level))
 
     def share(self, attenuation: float) -> NDArray[np.float32]:
         """Return the share of each voxel (z, y, x) that the sample takes, for the attenuation along its faces."""
-        core = ndimage.binary_erosion(self.inside, iterations=_RIM)
-        rim = ndimage.binary_dilation(self.inside, iterations=_RIM) & ~core
-        skin = ndimage.binary_erosion(self.inside) & ~ndimage.binary_erosion(self.inside, iterations=1 + _SKIN)
+        core = self.core
+        rim = ndimage.binary_dilation(self.inside) & ~core
+        skin = core & ~ndimage.binary_erosion(core, iterations=_SKIN)
         level = float(np.median(self.values[skin])) if skin.any() else self.level
         result = core.astype(np.float32)
         result[rim] = np.expm1(-attenuation / level * self.values[rim]) / np.expm1(-attenuation)
-        return np.asarray(result)
+        return result
 
 
 def find_outline(
@@ -217,7 +222,7 @@ def _fit(
     views: list[Image], geometry: ConeBeam, angle_rad: Floats, grid: Grid, sample: _Sample, binned: int
 ) -> tuple[float, float, float]:
     """Return path length, mm, as a polynomial of attenuation, from the middle rows of some views."""
-    hull = hull_of(sample.inside, grid, SLAB_VOXELS).grown((1 + _RIM) * grid.voxel_mm)
+    hull = hull_of(sample.inside, grid, SLAB_VOXELS).grown(2 * grid.voxel_mm)
     middle = slice(geometry.rows // 5, geometry.rows - geometry.rows // 5)
     window = geometry.cropped(middle.start, middle.stop, 0, geometry.columns)
     chosen = np.unique(np.linspace(0, len(angle_rad) - 1, _FIT_VIEWS).astype(int))
@@ -228,7 +233,7 @@ def _fit(
 
     def paths(share: NDArray[np.float32]) -> Image:
         """Return the paths (view, row, column), mm, through voxels (z, y, x), each by its share."""
-        volume = Volume(values=_framed(share), grid=grid, hull=hull)
+        volume = Volume(values=framed(share), grid=grid, hull=hull)
         return project_at_rest(volume, rays, (window.rows, window.columns))
 
     length = paths(sample.share(along_a_face / binned))
@@ -244,10 +249,3 @@ def _fit(
     curve = np.linspace(_DEEP * longest, longest, _CURVE_POINTS)
     c1, c2, c3 = np.linalg.lstsq((curve[:, None] ** powers @ a)[:, None] ** powers, curve, rcond=None)[0]
     return float(c1), float(c2), float(c3)
-
-
-def _framed(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return values (z, y, x) with one layer of zeros on every face."""
-    result = np.zeros_like(values)
-    result[1:-1, 1:-1, 1:-1] = values[1:-1, 1:-1, 1:-1]
-    return result

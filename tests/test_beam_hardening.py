@@ -13,6 +13,7 @@ from pdvc.volume import Hull
 SCANNER = ConeBeam(
     source_axis_mm=40.0, source_detector_mm=400.0, pixel_mm=0.5, rows=48, columns=52, column_shift_mm=0.8
 )
+COARSE = replace(SCANNER, pixel_mm=1.0, rows=24, columns=26)
 ANGLES = np.linspace(0, 2 * np.pi, 120, endpoint=False)
 HALF = np.array([0.65, 0.45])
 CENTRE = np.array([0.1, -0.05])
@@ -96,21 +97,19 @@ def test_nor_does_what_is_lighter_inside_and_stays_clear_of_the_faces_bend_the_c
 
 def test_pixels_that_average_intensities_move_no_face():
     """A pixel shows -ln <exp(-a)>: less than the attenuation of its mean path, where a face crosses it."""
-    scanner = replace(SCANNER, pixel_mm=1.0, rows=24, columns=26)
-    lengths = list(chords_across(scanner))
+    lengths = list(chords_across(COARSE))
     views = -np.log(np.mean([np.exp(-attenuation(each)) for each in lengths], axis=0)).astype(np.float32)
-    found = find_outline(lambda i: views[i], scanner, ANGLES, None)
+    found = find_outline(lambda i: views[i], COARSE, ANGLES, None)
     # 0.25 for faces where grey levels are half
     assert np.abs(slopes(found.polynomial, np.max(lengths)) - 1).max() < 0.05
 
 
 def test_nor_do_pixels_whose_attenuations_are_averaged():
-    scanner = replace(SCANNER, pixel_mm=1.0, rows=24, columns=26)
-    lengths = list(chords_across(scanner))
+    lengths = list(chords_across(COARSE))
     views = np.mean([attenuation(each) for each in lengths], axis=0).astype(np.float32)
 
     def off(binned):
-        found = find_outline(lambda i: views[i], scanner, ANGLES, None, binned=binned)
+        found = find_outline(lambda i: views[i], COARSE, ANGLES, None, binned=binned)
         return np.abs(slopes(found.polynomial, np.max(lengths)) - 1).max()
 
     assert off(5) < 0.04 < off(1)
